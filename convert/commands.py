@@ -31,6 +31,7 @@ from egosim_jax.io.run import write_json
 from egosim_jax.io.weights import WeightsError, hashes, link_others, mismatches
 from egosim_jax.runtime import command
 from egosim_jax.runtime.progress import track
+from egosim_jax.runtime.terminal import make_console, printable
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -56,7 +57,6 @@ class Inspect:
 
     def run(self) -> int:
         """Detect the networks, match them with the configs, print."""
-        from rich.console import Console
         from rich.table import Table
 
         from egosim_jax import configs
@@ -75,7 +75,7 @@ class Inspect:
                 f"{found.source.bytes / 1e9:.2f}",
                 ", ".join(n for n in configs.names() if fits(found, configs.get(n))) or "none",
             )
-        console = Console(width=160, markup=False, emoji=False, highlight=False)
+        console = make_console(width=160)
         console.print(table)
         names = dict.fromkeys(name for name, _ in known_tables())
         missing = [name for name in names if name not in {f.network for f in folder.found}]
@@ -86,7 +86,7 @@ class Inspect:
         if self.tensors:
             for source in (*(f.source for f in folder.found), *folder.unknown):
                 for name, tensor in source.tensors.items():
-                    print(f"{name}  {list(tensor.shape)}  {tensor.dtype.name}")
+                    print(printable(f"{name}  {list(tensor.shape)}  {tensor.dtype.name}"))
         return command.ExitCode.DONE
 
 
@@ -375,7 +375,7 @@ class Verify:
                     wrong.append(f"{found.network}: forward differs by more than rounding")
         if not reference.possible():
             print(f"no forward compared: that needs {', '.join(reference.MODULES)}")
-        print("\n".join(wrong), end="\n" if wrong else "")
+        print(printable("\n".join(wrong)), end="\n" if wrong else "")
         return command.ExitCode.FAILED if wrong else command.ExitCode.DONE
 
 

@@ -51,6 +51,7 @@ from egosim_jax.models.lora import (
     pairs,
     refuse,
 )
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -186,7 +187,9 @@ def _names(
     """
     keys = [key for key in source.tensors if not TEXT.search(key)]
     if text := len(source.tensors) - len(keys):
-        print(f"{source.name}: skipped {text} tensors of a text encoder", file=sys.stderr)
+        print(
+            printable(f"{source.name}: skipped {text} tensors of a text encoder"), file=sys.stderr
+        )
     refuse_others(keys, source=source.name, fix=MERGE)
     parsed = {key: parse(key, known) for key in keys}
     found = [name for name in parsed.values() if name is not None]

@@ -36,7 +36,7 @@ from egosim_jax.io.bounded import quote_path, read_bytes, read_json
 from egosim_jax.io.executables import share_with_jax
 from egosim_jax.io.mapped import digest, read_safetensors
 from egosim_jax.io.run import open_folder
-from egosim_jax.io.untrusted.npz import read_arrays
+from egosim_jax.io.untrusted.npz import array_names, read_arrays
 from egosim_jax.models.layers import init_sharded
 from egosim_jax.runtime.command import CommandExit, ExitCode, run_with_exit_codes
 from egosim_jax.sharding import batch_sharding, make_mesh
@@ -154,9 +154,7 @@ def read_shard(path: Path, sha256: str | None) -> dict[str, np.ndarray]:
     """Read a shard of latents. Raises `InputError` if its SHA-256 differs."""
     if digest(read_bytes(path, limit=SHARD_BYTES)) != sha256:
         raise InputError(f"{quote_path(path)} is damaged: not the SHA-256 in {FILES}. Copy it.")
-    with np.load(path, allow_pickle=False) as shard:
-        names = shard.files
-    return read_arrays(path, {}, others=names)
+    return read_arrays(path, {}, others=array_names(path))
 
 
 class BundleRun:

@@ -47,6 +47,7 @@ from egosim_jax.io.decoding import Decoding
 from egosim_jax.io.run import open_folder
 from egosim_jax.io.weights import hashes
 from egosim_jax.runtime.progress import track
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.sharding import check_batch, shard_params
 from egosim_jax.train.distributed import stop_if_preempted
 from egosim_jax.train.encode_windows import Damaged, PartWindows, Window, read_windows, windows
@@ -268,7 +269,7 @@ def _write(
                 for bad in (each for each in read if isinstance(each, Damaged)):
                     skipped.append(bad.window)
                     if bad.window[0] not in damaged:
-                        logger.warning("skipping %s", bad.message)
+                        logger.warning("skipping %s", printable(bad.message))
                     damaged.add(bad.window[0])
                     _check_skipped(damaged, source, none_left=False)
                     yield bad.window

@@ -20,6 +20,7 @@ from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.models.layers import Products
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.runtime.progress import track
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.train.config import TrainConfig, WeightsDtype, resume_mutable
 from egosim_jax.train.distributed import require_single_process, stop_if_preempted
 from egosim_jax.train.recipe import Recipe
@@ -297,7 +298,7 @@ class FromClips(FromScratch):
             )
             for problem in track(progress, f"packing {split}", total=len(items)):
                 if problem:
-                    print(f"skipped: {problem}", file=sys.stderr)
+                    print(printable(f"skipped: {problem}"), file=sys.stderr)
                 stop_if_preempted(out)
         return frames
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from egosim_jax.annotate.clip import SHEET
-from egosim_jax.io.bounded import read_bytes
+from egosim_jax.io.bounded import own_file, read_bytes
 from egosim_jax.io.run import write_text
 
 PAGE = "index.html"
@@ -42,8 +42,8 @@ def write_page(out: Path, report: Mapping[str, Any]) -> None:
         if "problem" in video:
             parts.append(_section("failed", name, video["problem"], None, {}))
     for number, about in enumerate(report["annotations"]):
-        sheet = out / about["video_id"] / SHEET
-        drawn = sheet if number < MAX_IMAGES and sheet.exists() else None
+        name = f"{about['video_id']}/{SHEET}"
+        drawn = own_file(out, name) if number < MAX_IMAGES else None
         title = f"{about['video_id']}: {about['status']}"
         text = about.get("reason") or about.get("row", {}).get("prompt", "")
         shown = ("quality", "hands", "cameras", "depth", "scale", "plate", "prior", "caption")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -23,7 +22,7 @@ from egosim_jax.annotate.frames import Plan
 from egosim_jax.data.recording import Recording
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.bounded import parse_json, quote_path, quote_text
-from egosim_jax.io.untrusted.npz import DAMAGE, read_arrays
+from egosim_jax.io.untrusted.npz import DAMAGE, array_names, read_arrays
 from egosim_jax.perception.estimates import (
     CameraEstimate,
     DepthEstimate,
@@ -137,9 +136,7 @@ def load(path: Path, record: Record, fields: Sequence[str], stage: str) -> Recor
     Raises `InputError` if the file is damaged.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            names = [name.removesuffix(".npy") for name in archive.namelist()]
-        arrays = read_arrays(path, {}, others=names)
+        arrays = read_arrays(path, {}, others=array_names(path))
         about = parse_json(arrays.pop("about").tobytes(), source=quote_path(path))
         found = {
             name: _decode_runs(arrays) if name == _RUNS else _build(name, arrays, about)

@@ -14,6 +14,7 @@ from egosim_jax.perception.estimates import ChosenRung
 from egosim_jax.rendering import RendererName
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.runtime.progress import track
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import check_counts
 
 if TYPE_CHECKING:
@@ -165,7 +166,7 @@ class Annotate:
             clips = (about for about in report["annotations"] if about["source"] == name)
             reasons = [video.get("problem"), *(about.get("reason") for about in clips)]
             for reason in dict.fromkeys(filter(None, reasons)):
-                print(f"{name}: no clip: {reason}", file=sys.stderr)
+                print(printable(f"{name}: no clip: {reason}"), file=sys.stderr)
         print(
             f"{counts['done']} clips done, {counts['refused']} refused, {counts['failed']} failed; "
             f"see {self.out / 'index.html'}",

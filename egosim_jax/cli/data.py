@@ -17,6 +17,7 @@ from egosim_jax.cli.triplets import Align, FromCaches, Mix, Static, ToDwm
 from egosim_jax.data.clip_files import Prompts
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.runtime.progress import track
+from egosim_jax.runtime.terminal import make_console, printable
 from egosim_jax.types import WAN_GRID, InputError, VideoGrid, VideoSpec, check_counts
 
 
@@ -98,7 +99,8 @@ class Pack:
         )
         skipped = 0
         for problem in filter(None, track(progress, "packing", total=len(items))):
-            print(f"skipped: {problem}", file=sys.stderr)  # at once: if all are, `pack` raises
+            # at once: if all are skipped, `pack` raises
+            print(printable(f"skipped: {problem}"), file=sys.stderr)
             skipped += 1
         print(self.out)
         return ExitCode.PARTIAL if skipped else ExitCode.DONE
@@ -181,7 +183,7 @@ class Encode:
                 decoding=self.decoding,
             )
         for number in skipped:
-            print(f"skipped: {source.name(number)}", file=sys.stderr)
+            print(printable(f"skipped: {source.name(number)}"), file=sys.stderr)
         print(self.out)
         return ExitCode.PARTIAL if skipped else ExitCode.DONE
 
@@ -274,7 +276,7 @@ class Check:
         found = 0
         for _, problems in track(check(self.shards), "checking", total=len(manifest.shards)):
             for problem in problems:
-                print(problem)
+                print(printable(problem))
             found += len(problems)
         summary = f"{manifest.records} records in {len(manifest.shards)} shards"
         print(f"{summary}: {found or 'no'} problems", file=sys.stderr)
@@ -328,7 +330,6 @@ class Stats:
 
     def run(self) -> int:
         """Read all records and print two tables."""
-        from rich.console import Console
         from rich.table import Table
 
         from egosim_jax.data.inspect import split_statistics
@@ -354,7 +355,7 @@ class Stats:
             frames = ", ".join(f"{n} ({count})" for n, count in sorted(split.lengths.items()))
             words = f"{split.words / split.records:.1f}"
             splits.add_row(name, str(split.records), frames, words)
-        console = Console()
+        console = make_console()
         console.print(table)
         console.print(splits)
         return ExitCode.DONE

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from egosim_jax.runtime.command import ExitCode
+from egosim_jax.runtime.terminal import make_console
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -57,9 +58,8 @@ class Doctor:
     def run(self) -> int:
         """Print versions, devices, memory and missing modules."""
         import jax
-        from rich.console import Console
 
-        console = Console(width=120, markup=False)
+        console = make_console(width=120)
         console.print(f"egosim-jax {metadata.version('egosim-jax')}, {platform.platform()}")
         console.print(f"Python {platform.python_version()}, {os.cpu_count()} CPUs")
         console.print(", ".join(f"{name} {_version(name)}" for name in LIBRARIES))

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import tyro
 
 from egosim_jax.runtime.command import ExitCode
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import InputError
 
 
@@ -49,7 +50,7 @@ class Export:
             check_new(self.out)
         found, damaged = dataset_export.open_sessions(self.sessions, self.session)
         for name, problem in damaged.items():
-            print(f"skipped session {name}: {problem}", file=sys.stderr)
+            print(printable(f"skipped session {name}: {problem}"), file=sys.stderr)
         if self.to == "lerobot":
             dataset_export.to_lerobot(found, self.out)
         elif self.to == "shards":

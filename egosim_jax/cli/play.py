@@ -124,7 +124,7 @@ class Play:
         from egosim_jax.interactive.play.viewer import LocalServer
 
         with contextlib.redirect_stdout(sys.stderr):  # viser prints a banner
-            return LocalServer(HOST, self.port, verbose=False)
+            return LocalServer(HOST, self.port)
 
 
 def _wait() -> None:

@@ -29,8 +29,16 @@ class Serve:
 
     help_groups: ClassVar[HelpGroups] = {
         "clips": ("perception", "steps", "batch"),
-        "limits": ("sessions", "queue", "threads", "max_steps", "connections", "step_timeout"),
-    }
+        "limits": (
+            "sessions",
+            "kept",
+            "queue",
+            "threads",
+            "max_steps",
+            "connections",
+            "step_timeout",
+        ),
+    }  # fmt: skip
     out: Path = Path("runs/serve")
     """Folder of the sessions."""
     config: str = "tabletop"
@@ -53,6 +61,8 @@ class Serve:
     """Port to listen on; 0 for a free one."""
     sessions: int = 64
     """Maximum number of open sessions."""
+    kept: int = 1000
+    """Maximum number of sessions that are closed and kept on disk."""
     queue: int = 32
     """Maximum number of waiting and running requests; further ones get status 429."""
     threads: int = 8
@@ -93,6 +103,7 @@ class Serve:
 
         limits = Limits(
             sessions=self.sessions,
+            kept=self.kept,
             queue=self.queue,
             threads=self.threads,
             steps=self.max_steps,

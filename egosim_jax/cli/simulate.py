@@ -15,6 +15,7 @@ from egosim_jax.rendering import RendererName
 from egosim_jax.rendering.portrait import up_of, write_portrait
 from egosim_jax.rendering.rerun_log import RECORDING, Recording
 from egosim_jax.runtime.command import ExitCode, HelpGroups
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import InputError, VideoSpec, check_counts, check_seed
 
 if TYPE_CHECKING:
@@ -219,10 +220,8 @@ class _Outputs:
                 )
             state = step.state
             print(folder / f"clip_{number}.mp4")
-            print(
-                f"clip {number}/{len(truths)}: {action.prompt} ({time.monotonic() - then:.1f} s)",
-                file=sys.stderr,
-            )
+            about = f"clip {number}/{len(truths)}: {action.prompt}"
+            print(printable(f"{about} ({time.monotonic() - then:.1f} s)"), file=sys.stderr)
             then = time.monotonic()
         if recording is not None:
             recording.close(state)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from egosim_jax.data.clip_files import Prompts
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.runtime.progress import track
+from egosim_jax.runtime.terminal import make_console, printable
 from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:
@@ -125,7 +126,6 @@ class Align:
         import dataclasses
         import sys
 
-        from rich.console import Console
         from rich.table import Column, Table
 
         from egosim_jax.data.metadata import read_metadata, select
@@ -147,14 +147,14 @@ class Align:
             try:
                 result = align_clip(files.prior, files.target, most_px=self.most_px)
             except InputError as error:
-                print(f"skipped: {files.video_id}: {error}", file=sys.stderr)
+                print(printable(f"skipped: {files.video_id}: {error}"), file=sys.stderr)
                 continue
             found[files.video_id] = {**dataclasses.asdict(result), "gain": result.gain}
             levels = result.psnr_full, result.psnr_inside, result.psnr_aligned, result.gain
             table.add_row(
                 files.video_id, *map(str, result.shift_px), *(f"{level:.2f}" for level in levels)
             )
-        Console().print(table)
+        make_console().print(table)
         if self.out is not None:
             write_json(self.out, {"most_px": self.most_px, "clips": found})
         if not found:

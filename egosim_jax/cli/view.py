@@ -15,6 +15,7 @@ from egosim_jax.io.journal import NAME as JOURNAL
 from egosim_jax.rendering.portrait import Up, up_of, write_portrait
 from egosim_jax.rendering.rerun_log import RECORDING
 from egosim_jax.runtime.command import ExitCode
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.train.run_page import PAGE, stages_of, write_page
 from egosim_jax.types import InputError
 
@@ -65,7 +66,7 @@ class View:
         low, high = state.points_m.min(axis=0), state.points_m.max(axis=0)
         size = " x ".join(f"{length:.2f}" for length in high - low)
         objects = ", ".join(state.names.values()) or "no named objects"
-        print(f"{len(state.points_m)} points, {size} m, {objects}")
+        print(printable(f"{len(state.points_m)} points, {size} m, {objects}"))
         print(out)
         return ExitCode.DONE
 

@@ -38,6 +38,7 @@ from egosim_jax.io.decoding import Damage, Decoding
 from egosim_jax.io.images import MAX_IMAGE_BYTES, read_image
 from egosim_jax.io.run import write_text
 from egosim_jax.io.video import VideoInfo, probe_video, read_video, write_video
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import WAN_GRID, InputError, Triplet, VideoGrid, VideoSpec
 
 logger = logging.getLogger(__name__)
@@ -211,7 +212,7 @@ def load_triplet(
             )
             if policy == "strict":
                 raise InputError(f"{why}. ({LENIENT} repeats the last frame)")
-            logger.warning("%s; the last frame is repeated", why)
+            logger.warning("%s; the last frame is repeated", printable(why))
         arrays[name] = fit_length(frames, spec.frames)
     image = _read_first_frame(files.first_frame, decoding)
     return Triplet(

@@ -8,7 +8,7 @@ recording is imported again; one that another source or other options made is re
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -17,6 +17,7 @@ from egosim_jax.data.readers import NOTE, Entry, Reader
 from egosim_jax.data.recorded_files import DESCRIPTION
 from egosim_jax.data.recording import Recording
 from egosim_jax.io.atomic import lock_folder
+from egosim_jax.io.bounded import check_inside, only_inside
 from egosim_jax.types import InputError, check_counts
 
 FIXED = {"camera": "fixed"}
@@ -46,11 +47,15 @@ def import_recordings(
     Raises `InputError` if the source is not of the reader's dataset.
     """
     check_counts({"--limit": limit})
-    entries = list(islice(reader.find(), limit))
-    return len(entries), _import(reader.dataset, entries, out)
+    sources = [value for value in vars(reader).values() if isinstance(value, Path)]
+    with only_inside(sources):
+        entries = list(islice(reader.find(), limit))
+    return len(entries), _import(reader.dataset, entries, (*sources, out), out)
 
 
-def _import(dataset: str, entries: Iterable[Entry], out: Path) -> Iterator[Outcome]:
+def _import(
+    dataset: str, entries: Iterable[Entry], folders: Sequence[Path], out: Path
+) -> Iterator[Outcome]:
     seen: dict[str, Path] = {}
     with lock_folder(out):
         for entry in entries:
@@ -62,7 +67,9 @@ def _import(dataset: str, entries: Iterable[Entry], out: Path) -> Iterator[Outco
                         "separately."
                     )
                 seen[name] = entry.source
-                yield _import_one(dataset, entry, out / name)
+                with only_inside(folders):
+                    outcome = _import_one(dataset, entry, out / name)
+                yield outcome
             except InputError as error:
                 yield Outcome(recording_id=name, problem=str(error))
 
@@ -84,6 +91,9 @@ def _import_one(dataset: str, entry: Entry, folder: Path) -> Outcome:
                 )
             return Outcome(recording_id=entry.recording_id, resumed=True, note=written.get(NOTE))
     recording = _without_placeholders(entry.read(folder))
+    for path in recording.depth.paths if recording.depth else ():
+        if path is not None:
+            check_inside(path)
     provenance = {**recording.provenance, **made_of}
     replace(recording, recording_id=entry.recording_id, provenance=provenance).save(folder)
     return Outcome(recording_id=entry.recording_id, note=provenance.get(NOTE))

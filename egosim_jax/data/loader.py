@@ -33,6 +33,7 @@ from egosim_jax.data.manifest import Manifest
 from egosim_jax.data.mixing import Mixture
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.io.bounded import listing
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import InputError
 
 logger = logging.getLogger(__name__)
@@ -119,7 +120,7 @@ def one_pass(
             read = [next(stream, None) for _ in range(own)]
             for bad in read:
                 if isinstance(bad, _Bad):
-                    logger.warning("skipping %s", bad.message)
+                    logger.warning("skipping %s", printable(bad.message))
             kept = [example if isinstance(example, dict) else filler for example in read]
             batch = {name: np.stack([example[name] for example in kept]) for name in filler}
             weight = [isinstance(example, dict) for example in read]
@@ -263,7 +264,7 @@ class _Healthy(grain.transforms.Filter):
         if not isinstance(element, _Bad):
             return True
         if element.message not in self.skipped:
-            logger.warning("skipping %s", element.message)
+            logger.warning("skipping %s", printable(element.message))
         self.skipped[element.message] += 1
         if len(self.skipped) > Loader.MAX_BAD:
             raise InputError(f"Too many records cannot be read: {listing(list(self.skipped))}")

@@ -37,8 +37,8 @@ MASK_NAME, HANDS_NAME, IMAGE_NAME = "pc_mask_video.mp4", "hand_kp_video.mp4", "h
 """Default file names, in the folder of the prior."""
 MAX_BYTES = 1 << 28
 """Maximum size of a metadata file in bytes."""
-MAX_COLUMNS = 256
-"""Maximum number of columns."""
+MAX_COLUMNS, MAX_CELLS = 256, 1 << 22
+"""Maximum number of columns, and of all cells."""
 
 
 def read_metadata(path: Path, *, prompts: Prompts = "prompts_rewrite") -> list[ClipFiles]:
@@ -58,15 +58,20 @@ def read_metadata(path: Path, *, prompts: Prompts = "prompts_rewrite") -> list[C
     clips: list[ClipFiles] = []
     problems = Problems()
     first_seen: dict[str, int] = {}
-    for line, cells in _json_rows(path) if path.suffix == ".jsonl" else csv_rows(path):
-        row = {name: cell.strip() if name in COLUMNS else cell for name, cell in cells.items()}
+    cells = 0
+    for line, read in _json_rows(path) if path.suffix == ".jsonl" else csv_rows(path):
+        row = {name: cell.strip() if name in COLUMNS else cell for name, cell in read.items()}
         found = list(_row_problems(row, first_seen))
         problems.add(f"line {line}{problem}" for problem in found)
         if not found:
             clips.append(_files(path, line, row))
             first_seen[clips[-1].video_id] = line
-        if len(clips) > MAX_CLIPS:
-            raise InputError(f"{quote_path(path)} lists more than {MAX_CLIPS:,} clips. Split it.")
+        cells += len(row)
+        if len(clips) > MAX_CLIPS or cells > MAX_CELLS:
+            raise InputError(
+                f"{quote_path(path)} lists more than {MAX_CLIPS:,} clips or {MAX_CELLS:,} cells. "
+                "Split it."
+            )
     problems.refuse(f"{quote_path(path)} cannot be used")
     if not clips:
         raise InputError(f"{quote_path(path)} lists no clips.")
@@ -153,8 +158,9 @@ def csv_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
     """Yield line number and cells of each row; raise `InputError` for an invalid table."""
     name = quote_path(path)
     try:
-        text = read_bytes(path, limit=MAX_BYTES).decode("utf-8-sig")
-        reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+        data = io.BytesIO(read_bytes(path, limit=MAX_BYTES))
+        lines = io.TextIOWrapper(data, encoding="utf-8-sig", newline="")
+        reader = csv.reader(lines, strict=True)
         header = [cell.strip() for cell in next(reader, [])]
         needed = (*REQUIRED, *(() if TARGET in header else ("video_id",)))
         absent = [column for column in needed if column not in header]

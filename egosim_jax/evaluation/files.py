@@ -14,6 +14,7 @@ import io
 import json
 import math
 from collections.abc import Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +24,18 @@ from matplotlib.figure import Figure
 from egosim_jax.evaluation.metrics.report import cell_of
 from egosim_jax.evaluation.result import Evaluation
 from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.bounded import plot_text
 from egosim_jax.io.run import write_json, write_text
+from egosim_jax.runtime.terminal import printable
 
 _LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
     "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$",
 }  # fmt: skip
+_FORMULAS = ("=", "+", "-", "@", "\uff1d", "\uff0b", "\uff0d", "\uff20")
+"""Beginnings of formulas, also in full width."""
+MAX_DRAWN = 40
+"""Maximum number of groups, and of methods, in the image."""
 ARROWS = {"higher": "↑", "lower": "↓"}
 """Arrow for the better direction of a measure."""
 
@@ -71,19 +78,28 @@ def to_csv(evaluation: Evaluation) -> str:
     for row in evaluation.rows:
         table.writerow(
             [
-                row.window.output_id,
-                row.window.files.video_id,
-                evaluation.group_of(row),
-                row.method,
+                *map(cell, (row.window.output_id, row.window.files.video_id)),
+                *map(cell, (evaluation.group_of(row), row.method)),
                 row.window.start + first,
                 row.shape.frames - first,
                 row.shape.width,
                 row.shape.height,
-                row.source,
+                cell(row.source),
                 *(repr(row.scores[k]) if k in row.scores else "" for k in evaluation.measured),
             ]
         )
     return buffer.getvalue()
+
+
+def cell(text: str) -> str:
+    """Return a text for CSV that a spreadsheet does not read as a formula."""
+    if not text.strip().startswith(_FORMULAS) and text[:1] not in ("\t", "\r", "\n"):
+        return text
+    try:
+        float(text)
+    except ValueError:
+        return f"'{text}"
+    return text
 
 
 def to_latex(evaluation: Evaluation) -> str:
@@ -115,20 +131,21 @@ def _arrow(better: str) -> str:
 
 def escape(text: str) -> str:
     """Return text with LaTeX's special characters escaped."""
-    return "".join(_LATEX.get(letter, letter) for letter in text)
+    return "".join(_LATEX.get(letter, letter) for letter in printable(text).replace("\n", " "))
 
 
 def draw(evaluation: Evaluation, path: Path) -> None:
     """Draw means and spreads: a row of plots for each group, a column for each measure."""
     matplotlib.use("agg")
-    groups = list(evaluation.summaries())
+    groups = list(evaluation.summaries())[:MAX_DRAWN]
     shown = [key for key in evaluation.shown if key in evaluation.measured]
-    count = max(len(evaluation.table(group)) for group in groups)
+    tables = {g: dict(islice(evaluation.table(g).items(), MAX_DRAWN)) for g in groups}
+    count = max(map(len, tables.values()))
     size = (4.2 * len(shown) + 2, (0.34 * count + 1.0) * len(groups))
     figure = Figure(figsize=size, layout="constrained")
     plots = figure.subplots(len(groups), len(shown), squeeze=False, sharey="row")
     for group, row in zip(groups, plots, strict=True):
-        table = evaluation.table(group)
+        table = tables[group]
         for key, axes in zip(shown, row, strict=True):
             column = evaluation.columns[key]
             for place, (title, summary) in enumerate(table.items()):
@@ -142,10 +159,10 @@ def draw(evaluation: Evaluation, path: Path) -> None:
                         color="tab:gray" if published else "tab:blue",
                         capsize=3,
                     )
-            axes.set_yticks(range(len(table)), list(table))
+            axes.set_yticks(range(len(table)), list(map(plot_text, table)))
             axes.set_ylim(len(table) - 0.5, -0.5)
-            axes.set_title(f"{evaluation.groups.get(group, group)}: {column.heading} "
-                           f"{ARROWS[column.better]}", fontsize=9)  # fmt: skip
+            title = f"{plot_text(evaluation.groups.get(group, group))}: {column.heading}"
+            axes.set_title(f"{title} {ARROWS[column.better]}", fontsize=9)
             axes.grid(axis="x", alpha=0.3)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=100)

@@ -39,6 +39,7 @@ from egosim_jax.io.run import open_folder
 from egosim_jax.io.video import read_video, write_video
 from egosim_jax.io.weights import hashes
 from egosim_jax.rendering.mesh import hand_mask
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.sharding import check_batch, make_mesh, parts
 from egosim_jax.types import Clip, InputError, MeshConfig, Triplet
 
@@ -357,7 +358,8 @@ class BatchJob:
     def _report(self, window: Window, *, status: str, **values: Any) -> None:
         """Append a line to results.jsonl."""
         if status == "failed":
-            print(f"failed: {window.output_id}: {values['error']}", file=sys.stderr)
+            problem = f"failed: {window.output_id}: {values['error']}"
+            print(printable(problem), file=sys.stderr)
         own = {
             "video_id": window.output_id,
             "source_id": window.files.video_id,

@@ -9,16 +9,26 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, NoReturn
 
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import InputError
 
 MAX_JSON_BYTES = 16 << 20
-"""Maximum size of a JSON document in bytes; its Python objects take up to 30 times as much."""
+"""Maximum size of a JSON document in bytes, unless a reader allows more."""
+MAX_MEMORY = 768 << 20
+"""Maximum memory of a document, its text and its values in bytes, estimated from above."""
+JSON_COSTS = {b",": 88, b"[": 104, b"{": 304, b":": 304}
+"""Bytes of memory that the value behind each mark takes at most, with its place in a container."""
+CSV_COSTS = {b",": 72, b"\n": 160, b"\r": 160}
+"""The same of the cells and rows of a CSV file."""
 MAX_QUOTED = 80
 """Maximum length of an untrusted value in a message, in characters."""
 
@@ -26,23 +36,65 @@ MAX_QUOTED = 80
 def open_regular(path: Path) -> io.BufferedReader:
     """Open a regular file for reading.
 
-    Raises `InputError` if it is missing, unreadable, a folder, a pipe, a socket or a device.
+    Raises `InputError` if it is missing, unreadable, a folder, a pipe, a socket, a device, a file
+    of the kernel, or outside the folders of `only_inside`.
     """
+    check_inside(path)
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except (OSError, ValueError) as error:  # ValueError: a NUL character in the name
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(f"{quote_path(path)} cannot be read: {reason}.") from error
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+    about = os.fstat(descriptor)
+    if not stat.S_ISREG(about.st_mode) or about.st_dev in _kernel_devices():
         os.close(descriptor)
-        raise InputError(f"{quote_path(path)} is not a regular file.")
+        raise InputError(f"{quote_path(path)} is not a regular file: give a file on a disk.")
     return os.fdopen(descriptor, "rb")
+
+
+@cache
+def _kernel_devices() -> frozenset[int]:
+    """Return the devices of /proc and /sys: their files are made while they are read."""
+    return frozenset(os.stat(path).st_dev for path in ("/proc", "/sys") if os.path.isdir(path))
+
+
+_ROOTS: ContextVar[tuple[Path, ...]] = ContextVar("roots", default=())
+
+
+@contextmanager
+def only_inside(sources: Iterable[Path]) -> Iterator[None]:
+    """Refuse files outside the given folders, or the folders of the given files, in this context.
+
+    A link could bring any file of the user into output that is made of data of others. In a
+    cache of the Hugging Face Hub, files are links to the repository's own blobs.
+    """
+    folders = {p if p.is_dir() else p.parent for s in sources for p in (s, s.resolve())}
+    folders = {folder.resolve() for folder in folders}
+    caches = {p.parent for folder in folders for p in folder.parents if p.name == "snapshots"}
+    token = _ROOTS.set((*folders, *caches))
+    try:
+        yield
+    finally:
+        _ROOTS.reset(token)
+
+
+def check_inside(path: Path) -> None:
+    """Raise `InputError` if a path is outside the folders of `only_inside`."""
+    roots = _ROOTS.get()
+    if roots and not any(path.resolve().is_relative_to(root) for root in roots):
+        raise InputError(
+            f"{quote_path(path)} is a link to a file outside of the source, which is not followed: "
+            "put a copy of the file in its place."
+        )
 
 
 def read_bytes(path: Path, *, limit: int) -> bytes:
     """Read a regular file of at most `limit` bytes. Raises `InputError` if it is larger."""
     with open_regular(path) as file:
-        data = file.read(limit + 1)
+        try:
+            data = file.read(limit + 1)
+        except OSError as error:
+            raise InputError(f"{quote_path(path)} cannot be read: {error.strerror}.") from error
     if len(data) > limit:
         raise InputError(f"{quote_path(path)} has more than {limit:,} bytes, the maximum.")
     return data
@@ -57,12 +109,14 @@ def parse_json(data: bytes, *, source: str, limit: int = MAX_JSON_BYTES) -> Any:
     """Parse one JSON document in UTF-8, with or without a byte order mark.
 
     Raises `InputError`, naming `source`, if it is too large, nested too deeply or not JSON, repeats
-    a name or holds half a surrogate pair.
+    a name or holds half a surrogate pair. A document that would expand to more than
+    `MAX_MEMORY` is refused before it is parsed.
     """
     if len(data) > limit:
         raise InputError(f"{source}: {len(data):,} bytes of JSON, more than {limit:,}.")
+    check_memory(data, JSON_COSTS, source=source)
     try:
-        value = json.loads(data.decode("utf-8-sig"), object_pairs_hook=_unique)
+        value = json.loads(data.decode("utf-8-sig"), object_pairs_hook=unique)
         if b"\\u" in data:
             _check_surrogates(value)
     except RecursionError:
@@ -70,6 +124,17 @@ def parse_json(data: bytes, *, source: str, limit: int = MAX_JSON_BYTES) -> Any:
     except ValueError as error:
         raise InputError(f"{source} is not valid JSON: {quote_text(str(error))}.") from error
     return value
+
+
+def check_memory(data: bytes, costs: Mapping[bytes, int], *, source: str) -> None:
+    """Raise `InputError` if a document, once parsed, would take more than `MAX_MEMORY`."""
+    memory = len(data) * (2 if data.isascii() else 5)
+    memory += sum(cost * data.count(mark) for mark, cost in costs.items())
+    if memory > MAX_MEMORY:
+        raise InputError(
+            f"{source}: its {len(data):,} bytes would take {memory:,} bytes of memory, more than "
+            f"{MAX_MEMORY:,}, the maximum. Split it."
+        )
 
 
 def read_lines(
@@ -138,6 +203,20 @@ def quote_text(text: str) -> str:
     return ascii(text[:MAX_QUOTED])[1:-1] + ("…" if len(text) > MAX_QUOTED else "")
 
 
+def plot_text(text: str) -> str:
+    """Return a title for matplotlib, which would read text between dollar signs as formulas."""
+    cut = text[:MAX_QUOTED] + ("…" if len(text) > MAX_QUOTED else "")
+    return printable(cut.replace("\n", " ")).replace("$", r"\$")
+
+
+def own_file(folder: Path, name: str) -> Path | None:
+    """Return the path of a regular file in a folder; None if absent, or behind a link out of it."""
+    path = folder / name
+    if path.is_file() and path.resolve().is_relative_to(folder.resolve()):
+        return path
+    return None
+
+
 def listing(items: Sequence[str], *, limit: int = 5) -> str:
     """Join findings on one line: the first `limit`, and the number of further ones."""
     more = f"; and {len(items) - limit:,} more" if len(items) > limit else ""
@@ -150,10 +229,11 @@ def quote_path(path: Path | str) -> str:
     return text if text.isprintable() else ascii(text)
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def unique(pairs: Sequence[tuple[Any, Any]]) -> dict[Any, Any]:
+    """Return the map of pairs. Raises `ValueError` if a name is repeated."""
     found = dict(pairs)
     if len(found) != len(pairs):
-        seen: set[str] = set()
+        seen: set[Any] = set()
         for name, _ in pairs:
             if name in seen:
                 _refuse(f"the name {quote(name)} is repeated")
@@ -161,12 +241,15 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
+_SURROGATE = re.compile("[\ud800-\udfff]")
+
+
 def _check_surrogates(value: Any) -> None:
     rest = [value]  # a stack: recursion would fail on deep documents
     while rest:
         item = rest.pop()
         if isinstance(item, str):
-            if any("\ud800" <= character <= "\udfff" for character in item):
+            if _SURROGATE.search(item):
                 _refuse(f"{quote(item)} holds half a surrogate pair")
         elif isinstance(item, dict):
             rest += item.keys()

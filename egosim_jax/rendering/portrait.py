@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -26,6 +27,10 @@ DISTANCE, FIELD_OF_VIEW = 3.0, 50.0
 Three quarters of the points are within the radius.
 """
 HEIGHT, WIDTH = 480, 640
+MIN_RADIUS_M, MAX_RADIUS_M = 0.02, 20.0
+"""Smallest and largest radius that is drawn as it is; the renderer draws from 1 cm to 100 m."""
+MAX_POINT_PX = 16
+"""Maximum size of a point in pixels: a sparse cloud would be slow, and hide itself."""
 
 
 def up_of(state: SceneState) -> Up:
@@ -43,7 +48,7 @@ def portrait(state: SceneState, *, up: Up) -> UInt8[np.ndarray, "3 480 640 3"]:
     """Return images of a state from the left, the front and the right, slightly from above.
 
     The front view looks the way a wearer does: along y if z is up, along z if -y is up. The point
-    size is the distance between neighboring points.
+    size is the distance between neighboring points, up to `MAX_POINT_PX`.
     """
     import open3d as o3d
 
@@ -51,8 +56,12 @@ def portrait(state: SceneState, *, up: Up) -> UInt8[np.ndarray, "3 480 640 3"]:
     forward = np.array({"z": (0.0, 1.0, 0.0), "-y": (0.0, 0.0, 1.0)}[up])
     rightward = np.cross(forward, upward)
     middle = np.median(state.points_m, axis=0).astype(float)
-    radius = float(np.quantile(np.linalg.norm(state.points_m - middle, axis=1), 0.75))
-    distance = DISTANCE * max(radius, 1e-6)
+    points = state.points_m.astype(float)
+    radius = float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.75)) or 1.0
+    if not MIN_RADIUS_M <= radius <= MAX_RADIUS_M:  # in another unit, or nearly one point
+        points, middle, radius = (points - middle) / radius, np.zeros(3), 1.0
+        state = replace(state, points_m=points.astype(np.float32))
+    distance = DISTANCE * radius
     poses = []
     for side in np.radians(SIDES):
         level = np.cos(side) * forward - np.sin(side) * rightward
@@ -70,4 +79,5 @@ def portrait(state: SceneState, *, up: Up) -> UInt8[np.ndarray, "3 480 640 3"]:
         height=HEIGHT,
         width=WIDTH,
     )
-    return render(state, cameras, point_px=1 + round(2 * focal * spacing / distance)).frames
+    point_px = min(1 + round(2 * focal * spacing / distance), MAX_POINT_PX)
+    return render(state, cameras, point_px=point_px).frames

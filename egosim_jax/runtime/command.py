@@ -11,7 +11,7 @@ import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import is_dataclass, replace
+from dataclasses import MISSING, fields, is_dataclass, replace
 from enum import IntEnum
 from importlib import metadata
 from typing import (
@@ -25,6 +25,7 @@ from typing import (
 )
 
 from egosim_jax.runtime import interrupts
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -106,6 +107,7 @@ def main(
             config=(tyro.conf.OmitSubcommandPrefixes,),
             registry=_rules(given),
         )
+        _refuse_empty(command)
         with context():
             code = command.run()
         if args is None:
@@ -113,6 +115,17 @@ def main(
         return code
 
     return run_with_exit_codes(run)
+
+
+def _refuse_empty(command: Any) -> None:
+    """Raise `InputError` for an option that takes several values, and was given without one."""
+    for field in fields(command):
+        value = getattr(command, field.name)
+        if is_dataclass(value):
+            _refuse_empty(value)
+        elif value == () and field.default != () and field.default_factory is MISSING:
+            name = field.name.replace("_", "-")
+            raise InputError(f"--{name} has no value: give one or more, or omit it. (--{name})")
 
 
 def _rules(args: Sequence[str]) -> ConstructorRegistry:
@@ -195,10 +208,10 @@ def run_with_exit_codes(run: Callable[[], int]) -> int:
     try:
         return run()
     except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {printable(error)}", file=sys.stderr)
         return ExitCode.USAGE
     except CommandExit as early:
-        print(early, file=sys.stderr)
+        print(printable(early), file=sys.stderr)
         return early.code
     except KeyboardInterrupt:
         interrupts.print_how_to_continue()
@@ -207,9 +220,9 @@ def run_with_exit_codes(run: Callable[[], int]) -> int:
         if isinstance(error, BrokenPipeError) and _reader_ended():
             return ExitCode.FAILED
         if (reason := system_failure(error)) is not None:
-            print(f"error: {reason}", file=sys.stderr)
+            print(f"error: {printable(reason)}", file=sys.stderr)
         else:  # a bug: show where
-            traceback.print_exc()
+            print(printable(traceback.format_exc()), end="", file=sys.stderr)
         return ExitCode.FAILED
     finally:
         _reader_ended()  # also after --help, which exits

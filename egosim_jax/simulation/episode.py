@@ -45,7 +45,8 @@ from egosim_jax.io.bounded import (
 )
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.images import read_image
-from egosim_jax.io.untrusted.npz import DAMAGE, read_arrays
+from egosim_jax.io.untrusted.npz import read_arrays
+from egosim_jax.io.untrusted.zipped import Archive, from_file
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.simulation.actions import check_action, load_action, save_action
 from egosim_jax.state import snapshot
@@ -177,14 +178,13 @@ class Episode:
     @classmethod
     def from_bytes(cls, data: bytes) -> Episode:
         """Read the byte format. Raises `InputError` if it is damaged or not valid."""
-        with tempfile.TemporaryDirectory() as name:
+        with tempfile.TemporaryDirectory() as name, _without(f"{name}/"):
             folder = Path(name)
             try:
-                with zipfile.ZipFile(io.BytesIO(data)) as archive:
-                    _extract(archive, folder)
+                _extract(from_file(io.BytesIO(data), max_entries=2 * MAX_CLIPS + 4), folder)
             except InputError:
                 raise
-            except DAMAGE as error:
+            except ValueError as error:
                 raise InputError(
                     f"not a readable zip archive: {quote_text(str(error))}."
                 ) from error
@@ -242,25 +242,19 @@ def _write(folder: Path, episode: Episode) -> None:
     (folder / DESCRIPTION).write_text(text, encoding="utf-8")
 
 
-def _extract(archive: zipfile.ZipFile, folder: Path) -> None:
+def _extract(archive: Archive, folder: Path) -> None:
     """Write the entries of the byte format to a folder; raise `InputError` for any other."""
-    entries = archive.infolist()
-    names = [entry.filename for entry in entries]
-    if len(set(names)) != len(names) or len(names) > 2 * MAX_CLIPS + 4:
-        raise InputError("the archive has duplicate entries, or too many.")
-    for entry in entries:
-        # Stored entries cannot expand, so `MAX_BYTES` bounds the files too.
-        stored = (
-            entry.compress_type == zipfile.ZIP_STORED and entry.compress_size == entry.file_size
-        )
-        if not _NAMES.fullmatch(entry.filename) or not stored:
+    for entry in archive.entries.values():
+        # Stored entries cannot expand, so the size of the archive bounds the files too.
+        if not _NAMES.fullmatch(entry.name) or not entry.is_stored:
             raise InputError(
-                f"entry {quote(entry.filename)} is compressed or not part of an episode: an "
+                f"entry {quote(entry.name)} is compressed or not part of an episode: an "
                 "episode is an archive of stored files, as Episode.save writes it."
             )
-        path = folder / entry.filename
+    for name in archive.entries:
+        path = folder / name
         path.parent.mkdir(exist_ok=True)
-        path.write_bytes(archive.read(entry))
+        path.write_bytes(archive.read(name, limit=MAX_BYTES))
 
 
 def _read(folder: Path) -> Episode:
@@ -353,3 +347,12 @@ def _named(name: str) -> Iterator[None]:
         yield
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
+
+
+@contextmanager
+def _without(folder: str) -> Iterator[None]:
+    """Leave the path of a temporary folder out of the message of an `InputError`."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(str(error).replace(folder, "")) from error

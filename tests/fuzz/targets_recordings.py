@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import struct
+import zlib
 from fractions import Fraction
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import h5py
@@ -114,6 +118,56 @@ def read_lzfse(folder: Path) -> Any:
         raise InputError(str(error)) from error
 
 
+FILLS: tuple[Any, ...] = (0, 1, float("nan"), float("inf"), -1e308)
+SIZES = (0, 1, 3, 1 << 10, 1 << 18, 1 << 22, 1 << 40)
+
+
+def other_hdf5(data: bytes, random: Random) -> bytes:
+    """Write datasets of other shapes, kinds, chunks and filters, mostly of fill values."""
+    file = io.BytesIO()
+    with h5py.File(file, "w") as written, contextlib.suppress(ValueError, TypeError, OSError):
+        for name, shape in (("camera/intrinsic", (3, 3)), ("transforms/camera", (3, 4, 4))):
+            shape = random.choice((shape, (random.choice(SIZES), *shape[1:]), shape[1:]))
+            options: dict[str, Any] = {"fillvalue": random.choice(FILLS)}
+            if random.random() < 0.5:
+                options["chunks"] = tuple(random.choice((1, 4, 1 << 12)) for _ in shape)
+                options["maxshape"] = (None,) * len(shape)
+                options["compression"] = random.choice((None, "gzip", "lzf"))
+            kind = random.choice(("f4", "f8", "i1", "u8", "S9", "f2", h5py.string_dtype()))
+            dataset = written.create_dataset(name, shape, kind, **options)
+            if options.get("compression") == "gzip" and random.random() < 0.5:
+                bomb = zlib.compress(bytes(random.choice((9, 10**6, 10**8))))
+                dataset.id.write_direct_chunk((0,) * len(shape), bomb)
+        link = random.choice((h5py.SoftLink("/x"), h5py.ExternalLink("/etc/passwd", "/x"), None))
+        if link is not None:
+            del written["camera/intrinsic"]
+            written["camera/intrinsic"] = link
+        texts = random.choice(("a", ["a"] * random.choice((1, 5000)), 3, [b"\xff", b"b"]))
+        written.attrs["llm_objects"] = texts
+    return file.getvalue()
+
+
+def other_parquet(data: bytes, random: Random) -> bytes:
+    """Write columns of other kinds and encodings, mostly of equal values."""
+    file, rows = io.BytesIO(), random.choice((0, 1, 1000, 1 << 20, 3 << 20))
+    text, index = "x" * random.choice((1, 100, 1 << 20)), np.zeros(rows, np.int8)
+    kinds = (
+        lambda: pa.DictionaryArray.from_arrays(index, [text]),
+        lambda: pa.DictionaryArray.from_arrays(index, pa.array([[text] * 9])),
+        lambda: pa.array(np.full(rows, random.choice(FILLS))),
+        lambda: pa.nulls(rows, pa.list_(pa.float32())),
+        lambda: pa.array(np.zeros(rows, "M8[ns]")),
+        lambda: pa.array([{"a": [{"b": 1}] * 9}] * min(rows, 100_000)),
+    )
+    with contextlib.suppress(pa.ArrowException, ValueError):
+        columns = {name: random.choice(kinds)() for name in COLUMNS}
+        size = min(len(column) for column in columns.values())
+        table = pa.table({name: column.slice(0, size) for name, column in columns.items()})
+        packing = random.choice(("none", "snappy", "gzip", "zstd", "brotli"))
+        pq.write_table(table, file, compression=packing, store_schema=random.random() < 0.5)
+    return file.getvalue()
+
+
 TARGETS: list[Target] = [
     Target(
         name="recording",
@@ -122,13 +176,21 @@ TARGETS: list[Target] = [
         files=("recording.json", "arrays.npz"),
         sealed=True,
     ),
-    Target(name="hdf5", make=make_hdf5, read=read_hdf5, files=("*.h5",), lossy=NO_CHECKSUM),
+    Target(
+        name="hdf5",
+        make=make_hdf5,
+        read=read_hdf5,
+        files=("*.h5",),
+        lossy=NO_CHECKSUM,
+        mutations=(other_hdf5,) * 4,
+    ),
     Target(
         name="parquet",
         make=make_parquet,
         read=read_parquet,
         files=("*.parquet",),
         lossy=NO_CHECKSUM,
+        mutations=(other_parquet,) * 4,
     ),
     Target(name="colmap", make=make_colmap, read=read_colmap, files=("*/*",), lossy=NO_CHECKSUM),
     Target(name="lzfse", make=make_lzfse, read=read_lzfse, files=("a.depth",), lossy=NO_CHECKSUM),

@@ -22,7 +22,7 @@ from tests.fuzz.target import Target
 
 MODULES = (
     "targets_run", "targets_convert", "targets_media", "targets_data", "targets_recordings",
-    "targets_serving",
+    "targets_serving", "targets_expanding",
 )  # fmt: skip
 MAX_SECONDS, MAX_BYTES, MAX_MESSAGE = 20, 1 << 30, 4000
 
@@ -86,7 +86,7 @@ def _outcome(target: Target, folder: Path, want: str) -> dict[str, Any]:
         signal.alarm(0)
     if time.monotonic() - then > MAX_SECONDS:
         return {**found, "outcome": "slow"}
-    grown = _status("VmHWM") - before
+    grown = _status("VmHWM") - before + sum(_status("VmHWM", pid) for pid in _children())
     return {**found, "outcome": "memory", "detail": f"{grown:,}"} if grown > MAX_BYTES else found
 
 
@@ -117,14 +117,22 @@ def _too_slow(*_: Any) -> None:
 
 
 def _peak_reset() -> int:
-    Path("/proc/self/clear_refs").write_text("5", "ascii")
+    for process in ("self", *_children()):
+        Path(f"/proc/{process}/clear_refs").write_text("5", "ascii")
     return _status("VmRSS")
 
 
-def _status(name: str) -> int:
-    lines = Path("/proc/self/status").read_text("ascii").splitlines()
-    (line,) = (line for line in lines if line.startswith(f"{name}:"))
-    return int(line.split()[1]) * 1024
+def _children() -> list[str]:
+    """The processes that this one started and that run, such as readers of HDF5."""
+    found = [p.read_text("ascii").split() for p in Path("/proc/self/task").glob("*/children")]
+    return [pid for pids in found for pid in pids if _status("VmRSS", pid)]
+
+
+def _status(name: str, process: str = "self") -> int:
+    """A size of a process in bytes; 0 if it has ended."""
+    lines = Path(f"/proc/{process}/status").read_text("ascii").splitlines()
+    values = [int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{name}:")]
+    return sum(values)
 
 
 def _say(record: dict[str, Any]) -> None:

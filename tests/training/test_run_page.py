@@ -2,6 +2,7 @@
 
 import base64
 import io
+import json
 import re
 
 import numpy as np
@@ -103,3 +104,102 @@ def test_view_writes_the_page_of_a_training(tmp_path, capsys):
 def test_a_folder_without_a_training_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"needs metrics\.jsonl"):
         write_page(tmp_path)
+
+
+HOSTILE_METRICS = {
+    "mathtext": {"$\\foo$": 1.0, "$": 2.0, "$a$b$": 3.0, "\\": 1.0},
+    "controls": {"\x1b[31mred": 1.0, "a\nb": 1.0, "\u202e": 1.0, "": 1.0, "_hidden": 1.0},
+    "numbers": {"big": 10**400, "inf": "1e999", "nan": float("nan"), "bool": True, "text": "x"},
+    "wide": {"wide": 1e308, "small": 5e-324, "negative": -1e308},
+    "nested": {"list": [1, [2]], "map": {"a": {}}, "null": None},
+    "many": {f"name_{number}": float(number) for number in range(300)},
+    "long": {"x" * 100_000: 1.0},
+    "html": {"</table><script>alert(1)</script>": 1.0, '"><img src=x>': 2.0},
+    "levels": {"validation_loss_" + "9" * 500: 1.0, "validation_loss_.": 2.0},
+}
+
+
+@pytest.mark.parametrize("kind", HOSTILE_METRICS)
+def test_a_page_is_made_of_any_metrics(tmp_path, kind):
+    run = write_stage(tmp_path / "run")
+    lines = [json.dumps({"step": step} | HOSTILE_METRICS[kind]) for step in (1, 2)]
+    lines[1] = lines[1].replace("2", "3", 1).replace('"1e999"', "1e999")
+    text = "\n".join([*lines, '{"step": 1e999, "loss": 1}', '{"step": -1}', "[]", "7"]) + "\n"
+    with (run / "metrics.jsonl").open("a") as file:
+        file.write(text + json.dumps({"step": 10**30, "loss": 1.0}) + "\n")
+    page = write_page(run).read_text()
+    assert "<script" not in page
+    assert len(page) < 10_000_000
+
+
+def deep(depth: int) -> str:
+    return '{"a":' * depth + "1" + "}" * depth
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("config.json", '{"training": 3}'),
+        ("config.json", '{"training": {"steps": "many"}}'),
+        ("config.json", '{"training": {"steps": 1e999, "rate": ' + "9" * 4000 + "}}"),
+        ("config.json", '{"training": ' + deep(200) + "}"),
+        ("config.json", '{"training": ' + "[" * 300 + "]" * 300 + "}"),
+        ("times.json", '{"a": "x", "b": null, "c": [1]}'),
+        ("times.json", '{"a": 0}'),
+        ("times.json", '{"a": 1e999, "b": NaN, "c": -1e308}'),
+        ("environment.json", "[1, 2]"),
+    ],
+)
+def test_a_page_is_made_of_any_settings(tmp_path, name, text):
+    run = write_stage(tmp_path / "run")
+    (run / name).write_text(text)
+    assert "<h2>run: step 40" in write_page(run).read_text()
+
+
+def bomb() -> bytes:
+    data = io.BytesIO()
+    Image.new("1", (30_000, 30_000)).save(data, "PNG")
+    return data.getvalue()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"no image", bomb(), b"\x89PNG\r\n\x1a\n" + bytes(99)],
+    ids=["empty", "text", "bomb", "damaged"],
+)
+def test_an_image_that_cannot_be_shown_is_named(tmp_path, data):
+    run = write_stage(tmp_path / "run", samples=(20, 40))
+    (run / "samples" / "step_000020.png").write_bytes(data)
+    page = write_page(run).read_text()
+    assert "not shown: step_000020.png" in page
+    assert len(inline(page, "image/jpeg")) == 1
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["samples/step_000040.mp4", "samples/step_000040.png", "times.json", "environment.json"],
+)
+def test_a_link_out_of_the_run_is_not_embedded(tmp_path, name):
+    run = write_stage(tmp_path / "run", samples=(20, 40))
+    path, secret = run / name, tmp_path / "secret"
+    path.rename(secret)
+    path.symlink_to(secret)
+    shown = write_page(run).read_text()
+    path.unlink()
+    assert shown == write_page(run).read_text()
+
+
+def test_a_stage_or_folder_of_samples_that_is_a_link_is_not_shown(tmp_path):
+    other = write_stage(tmp_path / "other", samples=(40,))
+    run = write_stage(tmp_path / "run" / "own")
+    (tmp_path / "run" / "linked").symlink_to(other)
+    (run / "samples").symlink_to(other / "samples")
+    assert [stage.folder.name for stage in stages_of(tmp_path / "run")] == ["own"]
+    assert "data:video" not in write_page(tmp_path / "run").read_text()
+
+
+def test_names_that_are_no_text_are_shown_escaped(tmp_path):
+    run = write_stage(tmp_path / "run\udcff", samples=(40,))
+    image = run / "samples" / "step_000040.png"
+    image.rename(image.with_name("step_\udcfe.png"))
+    assert "run\\udcff" in write_page(run).read_text()

@@ -34,7 +34,14 @@ from egosim_jax.data.readers.lenses import Lens, Remap
 from egosim_jax.data.readers.rotations import make_poses
 from egosim_jax.data.readers.umetrack import FINGERS, HINGES, HandModel
 from egosim_jax.data.recording import Recording
-from egosim_jax.io.bounded import open_regular, parse_json, quote, quote_path, quote_text
+from egosim_jax.io.bounded import (
+    open_regular,
+    parse_json,
+    quote,
+    quote_path,
+    quote_text,
+    refusing,
+)
 from egosim_jax.io.images import decode_image
 from egosim_jax.io.video import write_frames
 from egosim_jax.types import Cameras, InputError
@@ -124,20 +131,24 @@ class _Clip:
     def __init__(self, tar: tarfile.TarFile, name: str):
         self.name = name
         members = []
-        for member in tar:
-            members.append(member)
-            if len(members) > MAX_MEMBERS:
-                raise InputError(f"{name} has more files than the maximum, {MAX_MEMBERS:,}.")
-        self._tar, self.names = tar, {m.name: m for m in members if m.isreg()}
+        with refusing(f"{name} is not a readable tar file"):
+            for member in tar:
+                member.pax_headers = {}  # each has a copy of the file's global header
+                members.append(member)
+                if len(members) > MAX_MEMBERS:
+                    raise InputError(f"{name} has more files than the maximum, {MAX_MEMBERS:,}.")
+        self._tar = tar
+        self.names = {m.name: m for m in members if m.isreg() and not m.issparse()}
 
     def read(self, name: str) -> bytes:
         """Return the bytes of a file."""
         member = self.names.get(name)
-        file = member and self._tar.extractfile(member)
-        if not member or not file or member.size > MAX_MEMBER_BYTES:
+        if not member or member.size > MAX_MEMBER_BYTES:
             why = "is too large" if member else "is missing"
             raise InputError(f"{self.name}: {quote_text(name)} {why}.")
-        return file.read()
+        with refusing(f"{self.name}: {quote_text(name)} cannot be read"):
+            file = self._tar.extractfile(member)
+            return file.read() if file else b""
 
     def json(self, name: str) -> Any:
         """Return the object in a JSON file."""
@@ -241,8 +252,8 @@ def _lens(calibrations: list[dict[str, Any]], name: str) -> Lens:
 @contextmanager
 def _open_clip(path: Path) -> Iterator[_Clip]:
     name = quote_path(path)
-    try:
-        with open_regular(path) as file, tarfile.open(fileobj=file, mode="r:") as tar:
+    with open_regular(path) as file:
+        with refusing(f"{name} is not a readable tar file"):
+            tar = tarfile.open(fileobj=file, mode="r:")  # noqa: SIM115
+        with tar:
             yield _Clip(tar, name)
-    except (tarfile.TarError, EOFError) as error:
-        raise InputError(f"{name} is not a readable tar file: {quote_text(str(error))}.") from error

@@ -18,7 +18,6 @@ the recording says so. Followed: nerfstudio 1.1, `record3d_utils.py`, and reader
 from __future__ import annotations
 
 import re
-import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -55,6 +54,7 @@ from egosim_jax.io.bounded import (
 )
 from egosim_jax.io.images import decode_image
 from egosim_jax.io.untrusted.npz import DAMAGE
+from egosim_jax.io.untrusted.zipped import from_file
 from egosim_jax.types import InputError, is_rigid
 
 MAX_FILE_BYTES = 1 << 28
@@ -146,15 +146,13 @@ def _open_capture(path: Path) -> Iterator[tuple[list[str], ReadFile]]:
         return
     with open_regular(path) as file:
         with _refusing(path):
-            archive = zipfile.ZipFile(file)
+            archive = from_file(file)
 
         def read(name: str) -> bytes:
             with _refusing(path):
-                if archive.getinfo(name).file_size > MAX_FILE_BYTES:
-                    raise InputError(f"{quote_path(path)}: {quote(name)} is too large.")
-                return archive.read(name)
+                return archive.read(name, limit=MAX_FILE_BYTES)
 
-        yield archive.namelist(), read
+        yield list(archive.entries), read
 
 
 @contextmanager

@@ -20,7 +20,14 @@ import tyro
 
 from egosim_jax.data.readers import Entry, find_files, inside, make_id
 from egosim_jax.data.recording import Recording
-from egosim_jax.io.bounded import listing, quote_path, quote_text, read_bytes
+from egosim_jax.io.bounded import (
+    CSV_COSTS,
+    check_memory,
+    listing,
+    quote_path,
+    quote_text,
+    read_bytes,
+)
 from egosim_jax.io.segments import probe_long_video
 from egosim_jax.types import InputError
 
@@ -70,8 +77,10 @@ def read_table(path: Path) -> list[tuple[str, str]]:
     """Return videos and captions of a table. Raises `InputError` if it has no such columns."""
     name = quote_path(path)
     try:
-        text = read_bytes(path, limit=MAX_BYTES).decode("utf-8-sig")
-        rows = list(csv.reader(io.StringIO(text, newline=""), strict=True))
+        data = read_bytes(path, limit=MAX_BYTES)
+        check_memory(data, CSV_COSTS, source=name)
+        text = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig", newline="")
+        rows = list(csv.reader(text, strict=True))
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{name} cannot be read as CSV: {quote_text(str(error))}.") from error
     header = [cell.strip().lower() for cell in rows[0]] if rows else []

@@ -109,14 +109,15 @@ def print_table(
     an interval from `low` to `high` in brackets, and the number of `known` values if some are
     missing.
     """
-    from rich.console import Console
     from rich.table import Table
+
+    from egosim_jax.runtime.terminal import make_console
 
     table = Table(corner, *(heading for heading, _ in measures.values()), title=title)
     for row, summary in rows.items():
         cells = (cell_of(summary.get(name, {}), form) for name, (_, form) in measures.items())
         table.add_row(row, *cells)
-    Console(width=160).print(table)
+    make_console(width=160).print(table)
 
 
 def cell_of(value: Mapping[str, float], form: str) -> str:

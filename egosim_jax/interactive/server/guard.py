@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import hmac
-import ipaddress
 import time
 from urllib.parse import SplitResult, urlsplit
 
@@ -13,6 +12,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from egosim_jax.interactive.origins import is_loopback
 from egosim_jax.interactive.server import wire
 from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.io.bounded import quote
@@ -138,11 +138,3 @@ def response(error: RequestError) -> JSONResponse:
     if error.retry_after_s is not None:
         headers["Retry-After"] = str(max(1, round(error.retry_after_s)))
     return JSONResponse(error.body(), status_code=error.status, headers=headers)
-
-
-def is_loopback(host: str) -> bool:
-    """Return True if a host is this machine's loopback."""
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False

@@ -23,10 +23,11 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, PlainTextResponse
 from starlette.exceptions import HTTPException
 
+from egosim_jax.interactive.origins import is_loopback
 from egosim_jax.interactive.server import wire
 from egosim_jax.interactive.server.connections import BoundedProtocol
 from egosim_jax.interactive.server.errors import RequestError
-from egosim_jax.interactive.server.guard import Guard, is_loopback, response, too_large, too_slow
+from egosim_jax.interactive.server.guard import Guard, response, too_large, too_slow
 from egosim_jax.interactive.server.prometheus import Metrics
 from egosim_jax.interactive.server.service import Service
 from egosim_jax.io.bounded import quote, quote_text

@@ -38,6 +38,7 @@ from egosim_jax.interactive.server.session import (
 )
 from egosim_jax.io.atomic import lock_folder
 from egosim_jax.io.bounded import quote, quote_path
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.simulation.start import Start, check_size
 from egosim_jax.types import InputError, check_counts
@@ -65,6 +66,8 @@ class Limits:
     """Maximum number of steps of a session."""
     saved: int = 100
     """Maximum number of saved starts of a session."""
+    kept: int = 1000
+    """Maximum number of sessions that are closed and kept."""
     connections: int = 256
     """Maximum number of client connections."""
     step_timeout_s: float = 120.0
@@ -74,7 +77,7 @@ class Limits:
         """Raise `InputError` unless all limits are positive."""
         check_counts({"queue": self.queue, "threads": self.threads, "sessions": self.sessions})
         check_counts({"steps of a session": self.steps, "saved starts": self.saved})
-        check_counts({"connections": self.connections})
+        check_counts({"connections": self.connections, "kept sessions": self.kept})
         if not self.step_timeout_s > 0:
             raise InputError(f"The timeout is {self.step_timeout_s} s: it must be positive.")
 
@@ -108,7 +111,8 @@ class Store:
                 key = (number, session.hash_of(number)) if session.pending else None
             except DAMAGE as error:
                 self.damaged[path.parent.name] = str(self._for_client(error))
-                print(f"cannot resume session {path.parent.name}: {error}", file=sys.stderr)
+                problem = f"cannot resume session {path.parent.name}: {error}"
+                print(printable(problem), file=sys.stderr)
                 continue
             self.sessions[session.id] = session
             if key is not None:
@@ -278,6 +282,7 @@ class Store:
         def run() -> str:
             with self._changing:
                 if keep:
+                    self._check_kept()
                     (session.folder / SETTINGS).rename(session.folder / CLOSED)
                 else:  # renamed first: a crash while files are deleted leaves no half session
                     shutil.rmtree(removed, ignore_errors=True)
@@ -288,6 +293,16 @@ class Store:
             return session.id
 
         return self.submit(run, changes=session)
+
+    def _check_kept(self) -> None:
+        count = sum(1 for _ in self.folder.glob(f"*/{CLOSED}"))
+        if count >= self.limits.kept:
+            raise RequestError(
+                429,
+                "too_many_kept",
+                f"{count} closed sessions are kept, the maximum of this server is "
+                f"{self.limits.kept}. Close it without keep, or have some folders removed.",
+            )
 
     def submit(
         self,

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from egosim_jax.io.bounded import quote, quote_text
+from egosim_jax.io.bounded import parse_json, quote, quote_text, unique
 from egosim_jax.types import InputError
 
 MAX_BYTES = 16 << 20
@@ -63,7 +63,7 @@ def unpack(data: bytes, *, limit: int | None = None) -> Any:
     try:
         value = msgpack.unpackb(
             data,
-            object_hook=lambda value: _unpacked(counted(value)),
+            object_pairs_hook=lambda pairs: _unpacked(unique(counted(pairs))),
             list_hook=counted,
             strict_map_key=True,
             max_array_len=max_length,
@@ -161,12 +161,7 @@ def unpack_json(data: bytes) -> dict[str, Any]:
             f"The body has {items:,} commas and brackets: it may have at most {MAX_ITEMS:,}. Send "
             "fewer rows, or use the websocket, which takes NumPy arrays."
         )
-    try:
-        value = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise InputError(
-            f"The body is not JSON: {quote_text(str(error))}. It must be a JSON object."
-        ) from error
+    value = parse_json(data, source="The body", limit=MAX_BYTES)
     if not isinstance(value, dict):
         raise InputError(f"The body is {quote(value)}: it must be a JSON object.")
     _check_depth(value)

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float, Int32, UInt8
 
 from egosim_jax.io.bounded import quote_path, read_bytes, refusing
-from egosim_jax.io.untrusted.isolated import read_file
+from egosim_jax.io.untrusted.isolated import MAX_ADDRESSES, TIMEOUT_S, read_file
 
 MAX_BYTES = 1 << 30
 """Maximum size of each file of a model in bytes."""
@@ -76,7 +76,9 @@ def read_model(folder: Path) -> Model:
         for part in PARTS:
             data = read_bytes(folder / f"{part}{suffix}", limit=MAX_BYTES)
             (Path(name) / f"{part}{suffix}").write_bytes(data if suffix == ".bin" else _plain(data))
-        return read_file(_read, folder, Path(name), suffix)
+        return read_file(
+            _read, folder, Path(name), suffix, max_memory=MAX_ADDRESSES, max_cpu_s=TIMEOUT_S
+        )
 
 
 def _plain(data: bytes) -> bytes:

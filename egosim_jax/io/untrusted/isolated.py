@@ -27,14 +27,18 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import IO, Any, NoReturn, TypeVar
 
-from egosim_jax.io.bounded import quote_path, quote_text
+from egosim_jax.io.bounded import check_inside, quote_path, quote_text
 from egosim_jax.runtime.processes import THREADS
 from egosim_jax.types import InputError
 
 T = TypeVar("T")
 TIMEOUT_S = 120.0
 """Time limit for a file in seconds, with the start of the child."""
-MAX_MEMORY = 1 << 32
+MAX_CPU_S = 15.0
+"""Maximum processor time that a file takes, in seconds."""
+MAX_MEMORY = 9 << 26
+"""Maximum size of the child's data while it reads a file, in bytes; about 150 MB are libraries."""
+MAX_ADDRESSES = 1 << 32
 """Maximum address space of the child that reads files, in bytes."""
 MAX_REPLY = 1 << 30
 """Maximum size of a result in bytes."""
@@ -72,7 +76,10 @@ class Child:
                     self.close()
                     result = TimeoutError()
             except (EOFError, OSError) as error:
-                raise ChildError(self._ending(process)) from error
+                ending = self._ending(process)
+                if process.returncode == -signal.SIGPROF:  # its processor time is over
+                    raise TimeoutError from error
+                raise ChildError(ending) from error
             except BaseException:  # Ctrl-C leaves a reply unread
                 self.close()
                 raise
@@ -132,23 +139,34 @@ class Child:
         return f"{how}: {lines[-1][:300] if lines else 'no message'}"
 
 
-def read_file(read: Callable[..., T], path: Path, *arguments: Any) -> T:
+def read_file(
+    read: Callable[..., T],
+    path: Path,
+    *arguments: Any,
+    max_memory: int | None = None,
+    max_cpu_s: float | None = None,
+) -> T:
     """Return the result of a function that reads an untrusted file, called in a child process.
 
-    Raises `InputError` if it crashes, hangs or takes more than `MAX_MEMORY`.
+    Raises `InputError` if it crashes, hangs, or takes more memory or processor time than allowed:
+    by default `MAX_MEMORY` and `MAX_CPU_S`.
     """
+    check_inside(path)
     name = quote_path(path)
+    max_memory, max_cpu_s = max_memory or MAX_MEMORY, max_cpu_s or MAX_CPU_S
     try:
-        return _READER.call(read, path, *arguments, timeout_s=TIMEOUT_S)
+        return _READER.call(
+            _limited, max_memory, max_cpu_s, read, path, *arguments, timeout_s=TIMEOUT_S
+        )
     except TimeoutError:
         raise InputError(
-            f"{name} could not be read within {TIMEOUT_S:g} s: the library hangs on it. It is "
-            "damaged; get it again."
+            f"{name} could not be read within {max_cpu_s:g} s: the library hangs on it. It is "
+            "damaged or too large. Get it again, or split it."
         ) from None
     except MemoryError:
         _READER.close()
         raise InputError(
-            f"{name} needs more memory than {MAX_MEMORY:,} bytes, the maximum: it is damaged or "
+            f"{name} needs more memory than {max_memory:,} bytes, the maximum: it is damaged or "
             "too large. Get it again, or split it."
         ) from None
     except ChildError as error:
@@ -156,6 +174,21 @@ def read_file(read: Callable[..., T], path: Path, *arguments: Any) -> T:
             f"{name} made the library that reads it crash, which {quote_text(str(error))}. It is "
             "damaged; get it again."
         ) from error
+
+
+def _limited(max_memory: int, max_cpu_s: float, read: Callable[..., T], *arguments: Any) -> T:
+    """Call a function with limits of memory and processor time; this runs in the child.
+
+    The kernel refuses what would exceed the memory, and ends the child when its time is over.
+    """
+    hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+    soft = max_memory if hard == resource.RLIM_INFINITY else min(max_memory, hard)
+    resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+    signal.setitimer(signal.ITIMER_PROF, max_cpu_s)
+    try:
+        return read(*arguments)
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
 
 
 def serve(descriptor: int, max_memory: int | None) -> NoReturn:
@@ -173,6 +206,7 @@ def serve(descriptor: int, max_memory: int | None) -> NoReturn:
         except MemoryError:
             reply = pickle.dumps(MemoryError())
         connection.send_bytes(reply)
+        del reply
 
 
 def _receive(connection: Connection, calls: SimpleQueue[bytes]) -> None:
@@ -183,5 +217,5 @@ def _receive(connection: Connection, calls: SimpleQueue[bytes]) -> None:
     os._exit(1)
 
 
-_READER = Child(max_memory=MAX_MEMORY)
+_READER = Child(max_memory=MAX_ADDRESSES)
 atexit.register(_READER.close)

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import io
 import math
-import zipfile
-import zlib
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from egosim_jax.io.bounded import open_regular, quote, quote_path, quote_text
+from egosim_jax.io.bounded import quote, quote_path, quote_text
+from egosim_jax.io.untrusted.zipped import Archive, open_archive
 from egosim_jax.types import InputError
 
 MAX_ARRAY_BYTES, MAX_PACKED_BYTES = 1 << 34, 1 << 26
 """Maximum size of a stored and of a compressed array, in bytes."""
-DAMAGE = (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, NotImplementedError,
-          RuntimeError)  # fmt: skip
-"""Exceptions of zipfile and NumPy for damaged archives."""
+DAMAGE = (ValueError, EOFError, OSError)
+"""Exceptions for damaged archives and arrays."""
 MAX_ENTRIES = 64
 """Maximum number of arrays in a file."""
 _HEADER = 4096
@@ -40,33 +38,40 @@ def read_arrays(
     checked against sizes before anything is built, contents against their CRC-32.
     """
     name = quote_path(path)
-    with open_regular(path) as file:
-        try:
-            with zipfile.ZipFile(file) as archive:
-                found = archive.infolist()
-                names = [entry.filename.removesuffix(".npy") for entry in found[:MAX_ENTRIES]]
-                dtypes = {**dtypes, **{n: d for n, d in (optional or {}).items() if n in names}}
-                if len(found) > MAX_ENTRIES or sorted(names) != sorted({*dtypes, *others}):
-                    listing = ", ".join(quote_text(n) for n in names[:8])
-                    raise InputError(f"{name} holds the arrays {listing}: not those expected.")
-                return {
-                    n: _read(archive, entry, dtypes.get(n), packed)
-                    for n, entry in zip(names, found, strict=True)
-                }
-        except InputError:
-            raise
-        except DAMAGE as error:
-            raise InputError(f"{name} is damaged: {quote_text(str(error))}.") from error
+    try:
+        with open_archive(path) as archive:
+            found = list(archive.entries)
+            names = [entry.removesuffix(".npy") for entry in found[:MAX_ENTRIES]]
+            dtypes = {**dtypes, **{n: d for n, d in (optional or {}).items() if n in names}}
+            if len(found) > MAX_ENTRIES or sorted(names) != sorted({*dtypes, *others}):
+                listing = ", ".join(quote_text(n) for n in names[:8])
+                raise InputError(f"{name} holds the arrays {listing}: not those expected.")
+            _check_sizes(archive, packed)
+            return {
+                n: read_npy(archive.read(entry, limit=MAX_ARRAY_BYTES), quote(entry),
+                            dtype=dtypes.get(n))
+                for n, entry in zip(names, found, strict=True)
+            }  # fmt: skip
+    except InputError:
+        raise
+    except DAMAGE as error:
+        raise InputError(f"{name} is damaged: {quote_text(str(error))}.") from error
 
 
-def _read(
-    archive: zipfile.ZipFile, entry: zipfile.ZipInfo, dtype: str | None, packed: bool
-) -> np.ndarray:
-    stored = entry.compress_type == zipfile.ZIP_STORED and entry.compress_size == entry.file_size
-    limit = MAX_ARRAY_BYTES if stored else MAX_PACKED_BYTES if packed else 0
-    if entry.file_size > limit:
-        raise ValueError(f"{quote(entry.filename)} is compressed or too large")
-    return read_npy(archive.read(entry), quote(entry.filename), dtype=dtype)
+def array_names(path: Path) -> list[str]:
+    """Return the names of the arrays of an npz. Raises `ValueError` if it is damaged."""
+    with open_archive(path) as archive:
+        return [name.removesuffix(".npy") for name in archive.entries]
+
+
+def _check_sizes(archive: Archive, packed: bool) -> None:
+    """Raise `ValueError` if an array is too large, or the compressed ones are together."""
+    unpacked = 0
+    for entry in archive.entries.values():
+        unpacked += 0 if entry.is_stored else entry.size
+        limit = MAX_ARRAY_BYTES if entry.is_stored else MAX_PACKED_BYTES if packed else 0
+        if entry.size > limit or unpacked > 4 * MAX_PACKED_BYTES:
+            raise ValueError(f"{quote(entry.name)} is compressed or too large")
 
 
 def read_npy(data: bytes, name: str, *, dtype: str | None = None) -> np.ndarray:

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from egosim_jax.io.bounded import open_regular, quote_path, quote_text
 from egosim_jax.io.untrusted.isolated import read_file
 from egosim_jax.types import InputError
@@ -26,10 +28,16 @@ def read_parquet(
     Raises `InputError` if a column that is not optional is missing, or if the file is damaged or
     declares more than is read.
     """
-    return read_file(_read, path, columns, optional)
+    found = read_file(_read, path, columns, optional)
+    return {
+        name: values.tolist() if isinstance(values, np.ndarray) else values
+        for name, values in found.items()
+    }
 
 
-def _read(path: Path, columns: Sequence[str], optional: Sequence[str]) -> dict[str, list[Any]]:
+def _read(
+    path: Path, columns: Sequence[str], optional: Sequence[str]
+) -> dict[str, np.ndarray | list[Any]]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -48,14 +56,27 @@ def _read(path: Path, columns: Sequence[str], optional: Sequence[str]) -> dict[s
                 )
             wanted = [*columns, *(column for column in optional if column in found)]
             _check_sizes(opened.metadata, wanted, name)
-            table = opened.read(columns=wanted, use_threads=False)
-            return {column: table.column(column).to_pylist() for column in wanted}
+            # Column by column: Arrow's copy of one is freed before the next one is read.
+            return {
+                column: _values(opened.read(columns=[column], use_threads=False).column(column))
+                for column in wanted
+            }
         except (pa.ArrowException, OSError, ValueError) as error:
             if isinstance(error, (InputError, MemoryError)):
                 raise
             raise InputError(
                 f"{name} is not a readable Parquet file: {quote_text(str(error))}."
             ) from error
+
+
+def _values(column: Any) -> np.ndarray | list[Any]:
+    """Return the values of a column; numbers without gaps as an array, a quarter of the size."""
+    import pyarrow as pa
+
+    kind = column.type
+    if column.null_count or not (pa.types.is_integer(kind) or pa.types.is_float64(kind)):
+        return column.to_pylist()
+    return column.to_numpy()
 
 
 def _check_sizes(metadata: Any, wanted: Sequence[str], name: str) -> None:

@@ -1,5 +1,6 @@
 """`egosim evaluate`: the compared videos, frames and sizes."""
 
+import csv
 import dataclasses
 import json
 import sys
@@ -9,6 +10,7 @@ import pytest
 from flax import nnx
 
 from egosim_jax.cli.evaluate import Evaluate
+from egosim_jax.evaluation.files import cell
 from egosim_jax.evaluation.metrics import lpips
 from egosim_jax.evaluation.metrics.image import psnr, ssim
 from egosim_jax.io.video import read_video, write_video
@@ -241,3 +243,42 @@ def test_invalid_results_are_refused(clips, run, line):
     (run / "results.jsonl").write_text(line + "\n")
     with pytest.raises(InputError, match=r"results\.jsonl, line 1"):
         Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run()
+
+
+HOSTILE = {
+    "mathtext": r"$\foo$",
+    "formula": "=cmd|' /C calc'!A0",
+    "sum": "@SUM(A1)",
+    "full width": "\uff1d1+1",
+    "tab": "\t=1+1",
+    "escape": "\x1b[31mred",
+    "markup": "[/red]<script>",
+    "LaTeX": r"\input{/etc/passwd}%",
+    "long": "x" * 3000,
+}
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_a_group_may_have_any_name(clips, run, kind, capsys):
+    with clips.open(newline="") as file:
+        rows = [row | {"split": HOSTILE[kind]} for row in csv.DictReader(file)]
+    with clips.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(rows)
+    assert Evaluate(generated=(str(run),), page_clips=1, metadata=clips).run() == ExitCode.DONE
+    said = capsys.readouterr()
+    assert all(line.isprintable() for line in (said.out + said.err).splitlines())
+    with (run / "scores.csv").open(newline="") as file:
+        scores = list(csv.DictReader(file))
+    assert not any(
+        cell.lstrip()[:1] in tuple("=+@\uff1d") for row in scores for cell in row.values()
+    )
+    assert all(float(row["psnr"]) > 0 for row in scores)
+    assert "<script" not in (run / "index.html").read_text()
+    assert "\\input" not in (run / "table.tex").read_text()
+
+
+@pytest.mark.parametrize("text", ["-1.5", "+3", "1e-5", "clip 1", "", "a=b", "-"])
+def test_numbers_and_names_of_a_csv_stay_as_they_are(text):
+    assert cell(text) == (f"'{text}" if text == "-" else text)

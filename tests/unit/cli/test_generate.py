@@ -93,3 +93,22 @@ def test_a_clip_of_another_prompt_or_window_is_not_taken_for_this_one(
     job(out=out, skip_existing=True).generate(before)
     with pytest.raises(InputError, match=message):
         job(out=out, skip_existing=True).generate(after)
+
+
+@pytest.mark.parametrize(
+    ("args", "name"),
+    [
+        (["generate", "--config", "debug", "--start"], "start"),
+        (["generate", "--start", "--config", "debug"], "start"),
+        (["data", "mix", "--out", "x", "--shards"], "shards"),
+        (["evaluate", "--metadata", "x.csv", "--generated"], "generated"),
+        (["evaluate", "--metadata", "x.csv", "--generated", "x", "--lpips"], "lpips"),
+    ],
+)
+def test_an_option_without_its_values_is_refused(args, name, capsys):
+    try:
+        code = main(args)
+    except SystemExit as error:  # tyro's own error
+        code = error.code
+    assert code == ExitCode.USAGE
+    assert name in capsys.readouterr().err

@@ -1,15 +1,20 @@
 """Untrusted bytes are bounded before anything is built from them, and never shown in full."""
 
+import io
 import json
 import os
+import tracemalloc
+from pathlib import Path
 
 import pytest
 
 from egosim_jax.io.bounded import (
     MAX_QUOTED,
     check_version,
+    only_inside,
     open_regular,
     parse_json,
+    plot_text,
     quote,
     quote_text,
     read_bytes,
@@ -62,6 +67,73 @@ def test_json_that_is_read(tmp_path):
     assert read_json(path) == value
     path.write_text(json.dumps(value, ensure_ascii=False), encoding="utf-8")
     assert read_json(path) == value
+
+
+@pytest.mark.parametrize(
+    "unit",
+    ["[],", "{},", "[[]],", '{"a":0},', '"a",', "0.5,", '"\U0001f600",', "1234,"],
+    ids=["lists", "maps", "nested", "small maps", "texts", "numbers", "wide texts", "integers"],
+)
+def test_json_that_would_fill_the_memory_is_refused_before_it_is_parsed(unit):
+    size = 64 << 20
+    data = f"[{unit * (size // len(unit.encode()))}0]".encode()
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=r"x\.json: its .* bytes of memory.*Split it"):
+            parse_json(data, source="x.json", limit=2 * size)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("unit", ["[],", '{"a":0},', '"ab",', "0.5,", '"\\u1234",'])
+def test_json_takes_no_more_memory_than_was_estimated(unit, monkeypatch):
+    data = f"[{unit * 50_000}0]".encode()
+    tracemalloc.start()
+    try:
+        value = parse_json(data, source="x.json")
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert len(value) == 50_001
+    monkeypatch.setattr("egosim_jax.io.bounded.MAX_MEMORY", peak)
+    with pytest.raises(InputError, match="Split it"):
+        parse_json(data, source="x.json")
+
+
+def test_links_out_of_the_source_are_refused_and_those_of_a_hub_cache_followed(tmp_path):
+    (tmp_path / "secret").write_text("mine")
+    source = tmp_path / "repo" / "snapshots" / "1f"
+    blobs = tmp_path / "repo" / "blobs"
+    for folder in (source, blobs):
+        folder.mkdir(parents=True)
+    (blobs / "5e").write_text("blob")
+    (source / "own").write_text("own")
+    for name, target in {"blob": blobs / "5e", "out": tmp_path / "secret", "in": "own"}.items():
+        (source / name).symlink_to(target)
+    with only_inside([source]):
+        for name, text in (("own", b"own"), ("in", b"own"), ("blob", b"blob")):
+            assert read_bytes(source / name, limit=9) == text
+        with pytest.raises(InputError, match="is a link to a file outside"):
+            read_bytes(source / "out", limit=9)
+    assert read_bytes(source / "out", limit=9) == b"mine"
+
+
+@pytest.mark.parametrize("name", ["self/mem", "self/status", "version"])
+def test_files_of_the_kernel_are_not_opened(name):
+    with pytest.raises(InputError, match="give a file on a disk"):
+        read_bytes(Path("/proc") / name, limit=100)
+
+
+@pytest.mark.parametrize(
+    "text", [r"$\foo$", "$x", r"\$a$b$", "a\nb", "\x1b[31m", "$" * 1000], ids=ascii
+)
+def test_titles_of_plots_are_no_formulas(text):
+    from matplotlib.figure import Figure
+
+    figure = Figure()
+    figure.subplots().set_title(plot_text(text))
+    figure.savefig(io.BytesIO(), format="png")
 
 
 def test_a_line_ends_with_a_line_feed_only_and_a_torn_one_is_dropped(tmp_path):

@@ -3,6 +3,7 @@
 import io
 import json
 import tarfile
+import tracemalloc
 
 import cv2
 import numpy as np
@@ -196,3 +197,41 @@ def test_a_hinge_turns_what_follows_it_and_the_right_hand_is_mirrored():
 def test_an_invalid_shape_is_refused(name, value):
     with pytest.raises(InputError, match="hand model"):
         HandModel.from_json(make_shape() | {name: value})
+
+
+def sparse(info):
+    """Headers of a sparse file whose map is damaged, or larger than the file."""
+    return [
+        {"GNU.sparse.major": "1", "GNU.sparse.minor": "0", "GNU.sparse.name": info.name},
+        {"GNU.sparse.map": "0,x", "GNU.sparse.size": "9"},
+        {"GNU.sparse.size": "1099511627776", "GNU.sparse.map": "0,512"},
+        {"GNU.sparse.size": "-1", "GNU.sparse.numblocks": "1", "GNU.sparse.offset": "x"},
+        {"size": "-5"},
+        {"path": "\0", "size": "x"},
+    ]
+
+
+@pytest.mark.parametrize("number", range(6))
+def test_headers_that_tarfile_does_not_expect_are_refused(tmp_path, imported, number):
+    source = tmp_path / "set"
+    source.mkdir()
+    with tarfile.open(source / "a.tar", "w", format=tarfile.PAX_FORMAT) as tar:
+        info = tarfile.TarInfo("000000.cameras.json")
+        info.pax_headers, info.size = sparse(info)[number], 600
+        tar.addfile(info, io.BytesIO(b"x" * 600))
+    assert "a.tar" in imported(Hot3D(source=source))[1]["a"]
+
+
+def test_the_headers_of_all_members_are_not_copied_to_each(tmp_path, imported):
+    source = tmp_path / "set"
+    source.mkdir()
+    headers = {f"comment.{number}": "x" for number in range(2000)}
+    with tarfile.open(source / "a.tar", "w", format=tarfile.PAX_FORMAT, pax_headers=headers) as tar:
+        for number in range(2000):
+            tar.addfile(tarfile.TarInfo(f"{number}"))
+    tracemalloc.start()
+    try:
+        assert "not a HOT3D clip" in imported(Hot3D(source=source))[1]["a"]
+        assert tracemalloc.get_traced_memory()[1] < 50_000_000
+    finally:
+        tracemalloc.stop()

@@ -1,10 +1,12 @@
 """A file that makes its library hang or crash is refused, and the next one is read."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+import zlib
 from pathlib import Path
 
 import h5py
@@ -92,14 +94,80 @@ def test_many_equal_rows_are_refused_before_they_are_read(tmp_path):
         read_parquet(tmp_path / "a.parquet", ["a"])
 
 
-def test_a_text_that_fills_the_memory_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(isolated, "_READER", isolated.Child(max_memory=1 << 31))
+def test_a_text_that_fills_the_memory_is_refused(tmp_path):
     rows = pa.DictionaryArray.from_arrays(np.zeros(1 << 20, np.int32), ["x" * (1 << 20)])
     pq.write_table(pa.table({"a": rows, "b": np.arange(1 << 20)}), tmp_path / "a.parquet")
     with pytest.raises(InputError, match=r"a\.parquet needs more memory"):
         read_parquet(tmp_path / "a.parquet", ["a"])
     assert len(read_parquet(tmp_path / "a.parquet", ["b"])["b"]) == 1 << 20
     isolated._READER.close()
+
+
+def chunk(path):
+    """A dataset of 72 bytes in a chunk of 512 MiB."""
+    with h5py.File(path, "w") as file:
+        options = {"chunks": (1 << 13, 1 << 13), "maxshape": (None, None), "compression": "gzip"}
+        file.create_dataset("x", (3, 3), "f8", **options)
+
+
+def deflated(path):
+    """A chunk of 2 kB whose stream unpacks to 1.5 GB."""
+    with h5py.File(path, "w") as file:
+        data = file.create_dataset("x", (16, 16), "f8", chunks=(16, 16), compression="gzip")
+        packer, packed = zlib.compressobj(9), b""
+        for _ in range(1500):
+            packed += packer.compress(bytes(1 << 20))
+        data.id.write_direct_chunk((0, 0), packed + packer.flush())
+
+
+def dictionary(path):
+    rows = pa.DictionaryArray.from_arrays(np.zeros(1 << 20, np.int32), ["x" * (1 << 20)])
+    pq.write_table(pa.table({"x": rows}), path)
+
+
+def runs(path):
+    """Lists of structs, all equal."""
+    rows = pa.array([{"b": [{"c": 1}] * 4}] * 500_000)
+    pq.write_table(pa.table({"x": rows}), path)
+
+
+def prefixes(path):
+    texts = ["q" * 2000 + str(number) for number in range(300_000)]
+    options = {"use_dictionary": False, "column_encoding": {"x": "DELTA_BYTE_ARRAY"}}
+    pq.write_table(pa.table({"x": texts}), path, **options)
+
+
+@pytest.mark.parametrize("write", [chunk, deflated, dictionary, runs, prefixes])
+def test_a_small_file_that_expands_is_refused_within_a_gigabyte(tmp_path, monkeypatch, write):
+    path = tmp_path / f"a.{'h5' if write in (chunk, deflated) else 'parquet'}"
+    write(path)
+    assert path.stat().st_size < 3_000_000
+    isolated._READER.close()
+    peaks, close = [], isolated.Child.close
+
+    def measure(child):
+        if child._process is not None:
+            peaks.append(Path(f"/proc/{child._process.pid}/status").read_text())
+        close(child)
+
+    monkeypatch.setattr(isolated.Child, "close", measure)
+    wanted = {"x": (None, None)}  # a name is enough for Parquet
+    with pytest.raises(InputError, match=path.name):
+        (read_hdf5 if path.suffix == ".h5" else read_parquet)(path, wanted)
+    isolated._READER.close()
+    (peak,) = re.findall(r"VmHWM:\s+(\d+) kB", peaks[0])
+    assert int(peak) < 1 << 20
+
+
+def test_a_reader_that_computes_for_too_long_is_ended(path):
+    with pytest.raises(InputError, match=r"within 0\.5 s"):
+        isolated.read_file(_busy, path, max_cpu_s=0.5)
+    assert read_hdf5(path, {"y": (1,)}).arrays["y"].tolist() == [0.5]
+
+
+def _busy(path):
+    while True:
+        pass
 
 
 def test_a_child_ends_with_a_parent_that_is_killed():
