@@ -50,6 +50,10 @@ class Service:
         """True if the server is shutting down and accepts no new requests."""
         return self.store.draining
 
+    def problem(self) -> str:
+        """Return why the server accepts no requests now, or empty text."""
+        return "draining" if self.draining else self.store.storage_problem()
+
     async def describe(self) -> dict[str, Any]:
         """Return the description that a client receives when it connects."""
         video, limits = self.store.backend.video, self.store.limits

@@ -233,7 +233,11 @@ class Session:
             )
         video = self.backend.video
         chunk = make_chunk(self.actions, rows, start=self.now, video=video, prompt=prompt)
-        self._accept(step_id, chunk, request)
+        try:
+            self._accept(step_id, chunk, request)
+        except OSError:
+            self._drop(step_id)
+            raise
         return self.finish(show)
 
     def _repeated(self, step_id: int, request: str) -> Result:
