@@ -23,7 +23,7 @@ SMALL_PX, SAMPLED_PX = 300, 150
 
 
 def vector_statistics(values: Float[np.ndarray, "n d"]) -> dict[str, np.ndarray]:
-    """Return the statistics of an episode's vectors, without their NaN; NaN if there are only NaN."""
+    """Return the statistics of an episode's vectors, without NaN; NaN where there is no number."""
     found = {name: np.full(values.shape[1], np.nan) for name in ("min", "max", "mean", "std")}
     found |= {name: np.full(values.shape[1], np.nan) for name in QUANTILES}
     for number, column in enumerate(values.T):

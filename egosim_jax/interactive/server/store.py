@@ -200,7 +200,7 @@ class Store:
         prompt = prompt_of(request)
         seed = 0 if (chosen := request.get("seed")) is None else check_integer(chosen, "seed")
         if not 0 <= seed <= MAX_SEED:
-            raise InputError(f"seed is {quote(seed)}: it must be from 0 to {MAX_SEED}.")
+            raise InputError(f"seed is {quote(seed)}: it must be from 0 to 2**63 - 1000000.")
         if (data := request.get("episode")) is not None:
             if not isinstance(data, bytes):
                 raise InputError(f"episode is {quote(data)}: it must be the bytes of a .zip.")
