@@ -26,7 +26,7 @@ Commands = Union[  # noqa: UP007 - a tuple of members
 
 def main(args: Sequence[str] | None = None, *, program: str = "egosim-train") -> int:
     """Run `egosim-train`; with `args`, in a process that may already have used its devices."""
-    from egosim_jax.train.distributed import distributed_context
+    from egosim_jax.train.distributed import training_context
 
     options = sys.argv[1:] if args is None else args
     without_training = any(option.partition("=")[0] == "--preflight" for option in options)
@@ -36,7 +36,7 @@ def main(args: Sequence[str] | None = None, *, program: str = "egosim-train") ->
         description="Train a model. The same command resumes an interrupted run. With --preflight "
         "it only reports whether the training would fit a machine, which can be absent.",
         args=args,
-        context=distributed_context if args is None and not without_training else nullcontext,
+        context=training_context if args is None and not without_training else nullcontext,
     )
 
 

@@ -16,16 +16,19 @@ import ipaddress
 import itertools
 import os
 import socket
+import sys
+import traceback
 import warnings
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
 from jax.experimental import multihost_utils
 
 from egosim_jax.runtime.command import CommandExit, ExitCode
+from egosim_jax.train.peers import HEARTBEAT_S, PEER_DIED, is_peer_failure, run_in_child
 from egosim_jax.types import InputError
 
 NAMES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
@@ -53,13 +56,39 @@ def distributed_context() -> Iterator[None]:
         _initialize(address, int(count), int(index))
     else:
         try:
-            jax.distributed.initialize()
+            jax.distributed.initialize(heartbeat_timeout_seconds=HEARTBEAT_S)
         except ValueError:  # no cluster
             _initialize(free_local_address(), 1, 0)
     try:
         yield
+    except jax.errors.JaxRuntimeError as error:
+        if jax.process_count() > 1:  # `shutdown` would wait for a dead process, then abort
+            _end_without_others(error)
+        raise
     finally:
         jax.distributed.shutdown()
+
+
+@contextmanager
+def training_context() -> Iterator[None]:
+    """Enter `distributed_context`, in a child process if the run has several processes."""
+    if _is_launched():
+        run_in_child()
+    with distributed_context():
+        yield
+
+
+def _end_without_others(error: Exception) -> NoReturn:
+    """End the process for an error of its devices, and do not wait for the other processes."""
+    code = ExitCode.FAILED
+    if is_peer_failure(error):
+        code = ExitCode.RESUBMIT
+        print(PEER_DIED, file=sys.stderr)
+    else:
+        traceback.print_exception(error)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def is_preempted() -> bool:
@@ -78,13 +107,14 @@ def stop_if_preempted(out: Path) -> None:
 
 
 def launched_context() -> AbstractContextManager[None]:
-    """Return `distributed_context` for a process of a launcher, and an empty context otherwise.
+    """Return `training_context` for a process of a launcher, and an empty context otherwise."""
+    return training_context() if _is_launched() else nullcontext()
 
-    Launchers set the variables of this module, or are Slurm or Open MPI with several tasks.
-    """
+
+def _is_launched() -> bool:
+    """Return True for the variables of this module, or Slurm or Open MPI with several tasks."""
     tasks = [os.environ.get(name, "1") for name in ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")]
-    launched = any(name in os.environ for name in NAMES) or any(count != "1" for count in tasks)
-    return distributed_context() if launched else nullcontext()
+    return any(name in os.environ for name in NAMES) or any(count != "1" for count in tasks)
 
 
 def _initialize(address: str, count: int, index: int) -> None:
@@ -95,8 +125,10 @@ def _initialize(address: str, count: int, index: int) -> None:
         # One process sends nothing to others. Gloo, the default, would listen all the same.
         jax.config.update("jax_cpu_collectives_implementation", None)
         options["heartbeat_timeout_seconds"] = FOREVER_S
-    elif local and index == 0:
-        _warn_of_gloo()
+    else:
+        options["heartbeat_timeout_seconds"] = HEARTBEAT_S
+        if local and index == 0:
+            _warn_of_gloo()
     jax.distributed.initialize(address, count, index, **options)
 
 

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -213,7 +213,10 @@ SHEET_FRAMES = 6
 
 @dataclass(frozen=True, kw_only=True)
 class Samples:
-    """Clips generated during training, always from the same noise, next to the ground truth."""
+    """Clips generated during training, always from the same noise, next to their targets.
+
+    A target is the VAE's reconstruction of the ground truth, the best that the denoiser can reach.
+    """
 
     model: ModelConfig
     """Model in training."""
@@ -229,7 +232,7 @@ class Samples:
         check_counts({"--samples": self.count})
 
     def write(self, networks: nnx.Module, out: Path, step: int) -> None:
-        """Write OUT/step_N.mp4 and .png: each generated clip next to its ground truth.
+        """Write OUT/step_N.mp4 and .png: each generated clip next to its decoded target.
 
         All processes of the training call it, under its mesh.
         """
@@ -247,10 +250,9 @@ class Samples:
         write_video(path, np.concatenate(pairs, axis=1), self.model.video.fps)
         frames = self.model.video.frames
         moments = np.linspace(0, frames - 1, SHEET_FRAMES).round().astype(int).tolist()
-        names = [record.metadata["video_id"] for record in self._records]
         blocks = [
-            SheetClip(f"{name}, step {step}: generated, ground truth", list(pair))
-            for name, *pair in zip(names, generated, targets, strict=True)
+            SheetClip(f"{name}, step {step}: generated, VAE reconstruction", list(pair))
+            for name, *pair in zip(_names(self._records), generated, targets, strict=True)
         ]
         draw_sheet(blocks, path.with_suffix(".png"), moments=moments)
 
@@ -283,6 +285,16 @@ class Samples:
             name: jax.make_array_from_callback(array.shape, where, array.__getitem__)
             for name, array in arrays.items()
         }
+
+
+def _names(records: Sequence[Record]) -> list[str]:
+    """Return a distinct name of each clip: its video and first frame, and a number if needed."""
+    names = []
+    for number, record in enumerate(records, start=1):
+        name, start = record.metadata["video_id"], record.metadata.get("start")
+        name = f"{name} from frame {start}" if start else str(name)
+        names.append(f"{name} ({number})" if name in names else name)
+    return names
 
 
 @jax.jit(static_argnums=(0, 3))

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from egosim_jax.annotate.frames import CHUNK, MAX_CLIP_FRAMES, Plan
 from egosim_jax.data.recording import Recording
+from egosim_jax.io.bounded import unlike
 from egosim_jax.types import WAN_GRID, InputError
 
 THUMB_PX = 160
@@ -63,7 +64,9 @@ class Quality:
             if bad:
                 limit = getattr(self, option[2:].replace("-", "_"))
                 raise RefusedError(
-                    rule, f"{rule}: {name} is {figures[name]:.3g}, beyond {limit:g}. ({option})",
+                    rule,
+                    f"{rule}: {name} is {unlike(figures[name], limit)}, beyond {limit:g}. "
+                    f"({option})",
                     figures,
                 )  # fmt: skip
 

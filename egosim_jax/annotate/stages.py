@@ -23,6 +23,7 @@ from egosim_jax.annotate.config import AnnotateConfig, Estimators, Side
 from egosim_jax.annotate.prepare import RefusedError
 from egosim_jax.annotate.record import Record
 from egosim_jax.geometry import invert, project, transform
+from egosim_jax.io.bounded import unlike
 from egosim_jax.perception.estimates import (
     LEFT,
     RIGHT,
@@ -37,6 +38,8 @@ from egosim_jax.types import Cameras, InputError
 SIDES = ("left", "right")
 MAX_MIRRORED = 0.35
 """Maximum fraction of a hand's frames in which its joints look like the other side's."""
+MAX_BOTH = 0.1
+"""Maximum fraction of frames with two hands in a clip whose one hand has a given side."""
 KEY_FRAMES = 6
 """Number of frames in a fused scene."""
 HAND_PHRASES = ("hand", "arm")
@@ -93,6 +96,11 @@ def find_hands(record: Record, estimators: Estimators, config: AnnotateConfig) -
     return record.add("hands", notes, hands=hands)
 
 
+def _share_of_both(seen: np.ndarray) -> float:
+    """Return the fraction of frames in which both hands are visible."""
+    return float(np.all(seen, axis=1).mean())
+
+
 def _check_sides(hands: HandTracks, seen: np.ndarray, side: Side) -> None:
     """Raise `RefusedError` if the side of a hand is often ambiguous and was not given."""
     if hands.mirrored is None or side != "auto":
@@ -102,8 +110,13 @@ def _check_sides(hands: HandTracks, seen: np.ndarray, side: Side) -> None:
         raise RefusedError(
             "hands",
             f"hands: the {SIDES[int(shares.argmax())]} hand has the joints of the other side in "
-            f"{worst:.0%} of its frames, more than {MAX_MIRRORED:.0%}: its fingers are hidden. "
-            "Give the side if there is one hand. (--side)",
+            f"{unlike(100 * worst, 100 * MAX_MIRRORED)}% of its frames, more than "
+            f"{MAX_MIRRORED:.0%}: its fingers are hidden. "
+            + (
+                "Annotate the parts in which they are visible. (--clips, --num-frames)"
+                if _share_of_both(seen) > MAX_BOTH
+                else "Give the side if there is one hand. (--side)"
+            ),
             {"mirrored": worst},
         )
 
@@ -260,9 +273,19 @@ def visible(hands: HandTracks) -> Bool[np.ndarray, "f 2"]:
 
 
 def _on_side(hands: HandTracks, side: Side) -> HandTracks:
-    """Return tracks with only the most confident hand of each frame, on the given side."""
+    """Return tracks with only the most confident hand of each frame, on the given side.
+
+    Raises `RefusedError` if two hands are visible: their tracks would become one.
+    """
     if side == "auto":
         return hands
+    if (share := _share_of_both(visible(hands))) > MAX_BOTH:
+        raise RefusedError(
+            "hands",
+            f"hands: two are visible in {unlike(100 * share, 100 * MAX_BOTH)}% of the frames, more "
+            f"than {MAX_BOTH:.0%}: a side can be given to a clip with one hand. Omit it. (--side)",
+            {"both": share},
+        )
     own = LEFT if side == "left" else RIGHT
     best = np.argmax(np.where(visible(hands), hands.presence, -1), axis=1)
     frames = np.arange(len(best))

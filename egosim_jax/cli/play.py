@@ -75,6 +75,11 @@ class Play:
         share_with_jax()
         config = configs.get(self.config)
         config = replace(config, steps=self.steps or config.steps)
+        print(
+            f"loading and compiling {self.config}: the first start takes minutes",
+            file=sys.stderr,
+            flush=True,
+        )
         generator = Generator.load(config, configs.weights_of(self.config, self.weights))
         streamer = Streamer(generator)
         world = GeneratedWorld(

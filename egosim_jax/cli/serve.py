@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -78,8 +79,9 @@ class Serve:
         """Check, load, compile, resume all sessions and serve."""
         missing = [name for name in NEEDS if find_spec(name) is None]
         if missing:
+            are = "which is" if len(missing) == 1 else "which are"
             raise InputError(
-                f"egosim serve needs {', '.join(missing)}, which is not installed: pip install "
+                f"egosim serve needs {' and '.join(missing)}, {are} not installed: pip install "
                 "'egosim-jax[serve]'."
             )
         check_counts({"--batch": self.batch, "--steps": self.steps, "--threads": self.threads})
@@ -89,6 +91,13 @@ class Serve:
 
         token = os.environ.get(TOKEN, "").strip() or None
         with bind(self.host, self.port, token=token) as bound:
+            made = f", compiled for batches of up to {self.batch}" if self.world != "true" else ""
+            print(
+                f"loading the {self.world} world of {self.config}{made}: the first start takes "
+                "minutes",
+                file=sys.stderr,
+                flush=True,
+            )
             service = self._service()
             finished = True
             try:

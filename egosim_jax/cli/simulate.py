@@ -115,6 +115,12 @@ class Simulate:
         Journal(folder, outputs=OUTPUTS)  # refuses a damaged journal before the weights are loaded
         free = ["simulate.weights", "simulate.first_frame", "simulate.episode"]
         open_folder(folder, made_of, mutable=free)
+        print(
+            f"{folder}: {len(episode.actions)} clips by {self.config}; the first one waits until "
+            "the model is compiled",
+            file=sys.stderr,
+            flush=True,
+        )
         simulator = Simulator(
             generator=Generator.load(config, weights, renderer=rendering.get(self.renderer)),
             perception=perception,

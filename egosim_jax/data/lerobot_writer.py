@@ -25,6 +25,12 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
+from egosim_jax.data.lerobot_statistics import (
+    aggregate,
+    image_statistics,
+    levels,
+    vector_statistics,
+)
 from egosim_jax.io.atomic import atomic_folder
 from egosim_jax.io.bounded import quote_path
 from egosim_jax.io.run import write_json
@@ -70,38 +76,13 @@ class EpisodeRecord:
 
 
 @dataclass
-class _Statistics:
-    """Running minimum, maximum, mean and standard deviation of a feature."""
-
-    shape: tuple[int, ...]
-    count: int = 0
-    low: Any = np.inf
-    high: Any = -np.inf
-    total: Any = 0.0
-    squares: Any = 0.0
-
-    def add(self, values: Float[np.ndarray, "n d"]) -> None:
-        self.count += len(values)
-        self.low = np.minimum(self.low, values.min(axis=0))
-        self.high = np.maximum(self.high, values.max(axis=0))
-        self.total = self.total + values.sum(axis=0)
-        self.squares = self.squares + np.square(values).sum(axis=0)
-
-    def result(self, frames: int) -> dict[str, Any]:
-        mean = self.total / self.count
-        deviation = np.sqrt(np.maximum(self.squares / self.count - mean**2, 0))
-        named = {"min": self.low, "max": self.high, "mean": mean, "std": deviation}
-        found = {name: np.reshape(value, self.shape).tolist() for name, value in named.items()}
-        return {**found, "count": [frames]}
-
-
-@dataclass
 class _Totals:
     tasks: dict[str, int] = field(default_factory=dict)
     episodes: list[dict[str, Any]] = field(default_factory=list)
     frames: int = 0
     sizes: set[tuple[int, ...]] = field(default_factory=set)
     vectors: dict[str, int] = field(default_factory=dict)
+    statistics: dict[str, list[dict[str, np.ndarray]]] = field(default_factory=dict)
 
 
 def check_new(folder: Path) -> None:
@@ -132,16 +113,14 @@ def write_lerobot(
             "A LeRobot dataset is written by pyarrow, which is not installed: pip install "
             "'egosim-jax[video]'."
         )
-    statistics = {IMAGE: _Statistics((3, 1, 1))}
     totals = _Totals()
     with atomic_folder(folder) as temporary:
         for episode in episodes:
             episode.save_scene(temporary / SCENE.format(len(totals.episodes)))
-            _write_episode(temporary, episode.clips, totals, statistics, fps)
+            _write_episode(temporary, episode.clips, totals, fps)
         if not totals.episodes:
             raise InputError("There are no episodes: a dataset needs at least one. Record one.")
-        _write_meta(temporary, totals, statistics, fps=fps, robot_type=robot_type,
-                    names=names)  # fmt: skip
+        _write_meta(temporary, totals, fps=fps, robot_type=robot_type, names=names)
 
 
 def _steps(
@@ -179,20 +158,21 @@ def _write_episode(
     folder: Path,
     clips: Iterable[ClipRecord],
     totals: _Totals,
-    statistics: dict[str, _Statistics],
     fps: int,
 ) -> None:
     number, images, prompts, steps = len(totals.episodes), [], [], []
+    counted = []
     for frame, prompt, step in _steps(clips, totals):
-        statistics[IMAGE].add(frame.reshape(-1, 3) / 255)
+        counted.append(levels(frame))
         images.append({"bytes": _png(frame), "path": None})
         prompts.append(prompt)
         totals.tasks.setdefault(prompt, len(totals.tasks))
         steps.append(step)
     vectors = {name: np.stack([step[name] for step in steps]) for name in steps[0]}
+    totals.statistics.setdefault(IMAGE, []).append(image_statistics(counted))
     for name, values in vectors.items():
-        totals.vectors[name] = size = values.shape[1]
-        statistics.setdefault(name, _Statistics((size,))).add(values.astype(float))
+        totals.vectors[name] = values.shape[1]
+        totals.statistics.setdefault(name, []).append(vector_statistics(values.astype(float)))
     count, first = len(steps), totals.frames
     columns = {
         IMAGE: images,
@@ -245,7 +225,6 @@ def _png(frame: np.ndarray) -> bytes:
 def _write_meta(
     folder: Path,
     totals: _Totals,
-    statistics: dict[str, _Statistics],
     *,
     fps: int,
     robot_type: str,
@@ -256,7 +235,7 @@ def _write_meta(
     _write_table(folder / "meta/episodes/chunk-000/file-000.parquet", rows)
     _write_tasks(folder / "meta/tasks.parquet", totals.tasks)
     frames = totals.frames
-    stats = {key: found.result(frames) for key, found in statistics.items()}
+    stats = {key: aggregate(found) for key, found in totals.statistics.items()}
     write_json(folder / "meta/stats.json", stats)
     (size,) = totals.sizes
     vector = {"dtype": "float32", "shape": [len(names)], "names": list(names)}

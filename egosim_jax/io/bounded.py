@@ -198,6 +198,14 @@ def quote(value: Any) -> str:
     return f"a {type(value).__name__}"
 
 
+def unlike(value: float, limit: float, *, digits: int = 3) -> str:
+    """Return a number beyond a limit, with as many digits as show that it is not the limit."""
+    for count in range(digits, 18):
+        if float(text := f"{value:.{count}g}") != limit:
+            return text
+    return repr(value)
+
+
 def quote_text(text: str) -> str:
     """Cut and escape text for a message, without quotation marks."""
     return ascii(text[:MAX_QUOTED])[1:-1] + ("…" if len(text) > MAX_QUOTED else "")

@@ -140,4 +140,14 @@ def _differences(recorded: Any, wanted: Any, path: str = "") -> dict[str, str]:
         return found
     if recorded == wanted:
         return {}
-    return {path: f"the folder has {quote(recorded)}, this run has {quote(wanted)}"}
+    lists = isinstance(recorded, list) and isinstance(wanted, list)
+    if lists and len(recorded) == len(wanted):
+        found = {}
+        for number, (one, other) in enumerate(zip(recorded, wanted, strict=True)):
+            found |= _differences(one, other, f"{path}.{number}")
+        return found
+    return {path: f"the folder has {_shown(recorded)}, this run has {_shown(wanted)}"}
+
+
+def _shown(value: Any) -> str:
+    return quote_text(json.dumps(value)) if isinstance(value, list | dict) else quote(value)

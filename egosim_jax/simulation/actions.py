@@ -199,10 +199,10 @@ def with_places(action: Action, placed_m: Float[np.ndarray, "f n j 3"]) -> Place
 
 def save_placed(folder: Path, name: str, action: Action) -> None:
     """Write an action to NAME.npz, and the joints of a `PlacedAction` to NAME_hands.npz."""
-    save_action(folder / f"{name}.npz", action)
-    if isinstance(action, PlacedAction):
+    if isinstance(action, PlacedAction):  # first: NAME.npz alone is an action without hidden hands
         with atomic_write(folder / f"{name}{HANDS_SUFFIX}") as temporary:
             np.savez(temporary, placed_m=np.ascontiguousarray(action.placed_m, float))
+    save_action(folder / f"{name}.npz", action)
 
 
 def load_placed(

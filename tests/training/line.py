@@ -19,7 +19,7 @@ from egosim_jax.data.shards import ShardWriter
 from egosim_jax.models.layers import Linear
 from egosim_jax.runtime.command import ExitCode, run_with_exit_codes
 from egosim_jax.train.config import OptimizerConfig, TrainConfig
-from egosim_jax.train.distributed import distributed_context
+from egosim_jax.train.distributed import training_context
 from egosim_jax.train.loop import train
 from egosim_jax.types import MeshConfig
 
@@ -105,7 +105,7 @@ def main(out: str, data: str, changes: str) -> int:
     task = Line(pause=settings.pop("pause", 0.0), hang=settings.pop("hang", -1))
 
     def run() -> int:
-        with distributed_context():
+        with training_context():
             train(task, training(**settings), data=Path(data), validation=None, out=Path(out))
         return ExitCode.DONE
 

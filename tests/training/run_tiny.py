@@ -13,7 +13,7 @@ from egosim_jax.io import weights
 from egosim_jax.runtime.command import ExitCode, run_with_exit_codes
 from egosim_jax.testing import tiny_model
 from egosim_jax.train.config import OptimizerConfig, TrainConfig
-from egosim_jax.train.distributed import distributed_context
+from egosim_jax.train.distributed import training_context
 from egosim_jax.train.loop import train
 from egosim_jax.train.tasks.denoising import Denoising
 from egosim_jax.types import VideoSpec
@@ -58,7 +58,7 @@ def main(data: str, out: str, steps: str, save_every: str, task: str = "egosim")
     """Train, and write the weights."""
 
     def run() -> int:
-        with distributed_context():
+        with training_context():
             schedule = training(int(steps), int(save_every))
             networks = train(TASKS[task], schedule, data=Path(data), validation=None, out=Path(out))
             weights.save(Path(out) / "dit.safetensors", networks.dit)

@@ -54,7 +54,7 @@ def test_several_processes_listen_where_their_address_says(initialized, monkeypa
         pass
     ((_, options),) = initialized
     assert (options["coordinator_bind_address"] == f"{host}:1234") == bound
-    assert "heartbeat_timeout_seconds" not in options
+    assert options["heartbeat_timeout_seconds"] == 45
     assert jax.config.values["jax_cpu_collectives_implementation"] == "gloo"
 
 

@@ -152,7 +152,8 @@ class ActionSpec:
             row, column = np.argwhere(~finite)[0].tolist()
             raise InputError(
                 f"Row {row} of the actions has {found[row, column]} as {self.names[column]}: all "
-                "must be finite."
+                "must be finite. Give a hand that is out of view its last place: it is hidden from "
+                "the model, and listed in hidden_hands."
             )
         low, high = self.bounds
         # float32 rounds some bounds outward
@@ -172,18 +173,15 @@ class ActionSpec:
         *,
         camera: Cameras,
         prompt: str,
-        hide: bool = False,
     ) -> tuple[Action, Bool[np.ndarray, " n"]]:
         """Return the action of one row per frame, and a mask of the hidden hands.
 
-        `camera` is the first camera of the episode. A hand that never comes near the view raises
-        `InputError`. With `hide` it becomes missing in a `PlacedAction` instead.
+        `camera` is the first camera of the episode. A hand that never comes near the view is
+        missing in the action, which is then a `PlacedAction`.
         """
         cameras = replace(camera, world_from_camera=self._cameras(rows, camera))
         joints = self.joints(rows)
-        lost = np.zeros(len(self.sides), bool)
-        if hide:
-            lost = np.logical_not(near_view(cameras, joints).any(axis=0, keepdims=True))[0]
+        lost = np.logical_not(near_view(cameras, joints).any(axis=0, keepdims=True))[0]
         seen = np.where(lost[None, :, None, None], np.nan, joints)
         action = Action(cameras=cameras, joints_m=seen, kind=self.kind, prompt=prompt)
         return with_places(action, joints) if lost.any() else action, lost

@@ -17,9 +17,10 @@ from jaxtyping import Bool, Float
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.batching import announced
 from egosim_jax.rendering import Renderer
+from egosim_jax.simulation.actions import check_action
 from egosim_jax.simulation.simulator import Simulator, Step
 from egosim_jax.simulation.start import Start
-from egosim_jax.types import Action, Cameras, SceneState, View
+from egosim_jax.types import Action, Cameras, SceneState, VideoSpec, View
 
 OBSERVATIONS = ("frames", "depth", "keypoints", "state")
 STATE_FIELDS = ("points_m", "colors", "object_ids")
@@ -67,21 +68,20 @@ def make_chunk(
     rows: object,
     *,
     start: Start,
-    frames: int,
+    video: VideoSpec,
     prompt: str | None = None,
-    hide: bool = False,
 ) -> Chunk:
-    """Return the chunk of 1 to `frames` - 1 rows after a start.
+    """Return the chunk of 1 to `video.frames` - 1 rows after a start; it hides hands out of view.
 
-    Raises `InputError` for invalid rows, and without `hide` for a hand out of view.
+    Environments and sessions both accept actions by this function. Raises `InputError` for invalid
+    rows, and for cameras that the state does not allow.
     """
-    given = spec.check(rows, max_rows=frames - 1)
-    padded = frames - 1 - len(given)
+    given = spec.check(rows, max_rows=video.frames - 1)
+    padded = video.frames - 1 - len(given)
     before = spec.rest if start.row is None else start.row
     path = np.concatenate([before[None], given, np.repeat(given[-1:], padded, axis=0)])
-    action, hidden = spec.to_action(
-        path, camera=start.camera, prompt=prompt or start.prompt, hide=hide
-    )
+    action, hidden = spec.to_action(path, camera=start.camera, prompt=prompt or start.prompt)
+    check_action(action, state=start.state, fps=video.fps, continued=True)
     return Chunk(action=action, rows=path, padded=padded, hidden=hidden)
 
 

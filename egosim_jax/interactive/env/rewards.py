@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from egosim_jax.simulation.simulator import Step
+from egosim_jax.simulation.start import Start
 from egosim_jax.types import InputError, SceneState, check_video
 
 
@@ -25,12 +26,8 @@ class Outcome:
         """Return the displacement of an object's center since the start, in meters."""
         pose = np.asarray(self.step.state.world_from_object.get(number, np.eye(4)), float)
         before = np.asarray(self.first.world_from_object.get(number, np.eye(4)), float)
+        check_object(self.first, number)
         points = self.first.points_m[self.first.object_ids == number]
-        if not len(points):
-            raise InputError(
-                f"Object {number} has no points in the first state: its position is unknown. "
-                f"Choose one of {sorted(set(self.first.names))}."
-            )
         center = np.append(points.astype(float).mean(axis=0), 1)
         return (pose @ np.linalg.inv(before) @ center - center)[:3]
 
@@ -56,6 +53,31 @@ class RewardFn(Protocol):
         ...
 
 
+def check_object(first: SceneState, number: int) -> None:
+    """Raise `InputError` unless the first state of an episode has points of an object."""
+    known = set(np.unique(first.object_ids).tolist()) - {0}
+    if number not in known:
+        raise InputError(
+            f"Object {number} has no points in the first state: its position is unknown. Choose "
+            f"one of {sorted(known)[:100]}, the keys of info['objects']."
+        )
+
+
+@runtime_checkable
+class StartChecker(Protocol):
+    """Reward function that refuses an episode which it cannot judge, at its reset."""
+
+    def check(self, start: Start) -> None:
+        """Raise `InputError` unless the reward is defined in an episode from a start."""
+        ...
+
+
+def check_reward(reward: RewardFn, start: Start) -> None:
+    """Run the check of a reward function that has one."""
+    if isinstance(reward, StartChecker):
+        reward.check(start)
+
+
 def no_reward(outcome: Outcome) -> Reward:
     """Return a reward of 0, for callers that compute their own from the frames."""
     return Reward(reward=0.0)
@@ -71,6 +93,10 @@ class MoveObject:
     """Target displacement in the world, in meters."""
     tolerance_m: float = 0.02
     """Maximum distance to the goal that counts as success, in meters."""
+
+    def check(self, start: Start) -> None:
+        """Raise `InputError` unless the state has points of the object."""
+        check_object(start.state, self.number)
 
     def __call__(self, outcome: Outcome) -> Reward:
         """Return the negative distance to the goal in meters; success ends the episode."""
@@ -93,10 +119,14 @@ class GoalImage:
         """Raise `InputError` unless the image is RGB uint8."""
         check_video("The goal image, as a clip of one frame,", self.image[None])
 
+    def check(self, start: Start) -> None:
+        """Raise `InputError` unless the image has the size of the frames."""
+        size = start.camera.height, start.camera.width
+        check_video("The goal image", self.image[None], (1, *size))
+
     def __call__(self, outcome: Outcome) -> Reward:
         """Return the negative LPIPS of the last frame to the goal; reaching it ends the episode."""
         last = outcome.step.clip.frames[-1:]
-        check_video("The goal image", self.image[None], (1, *last.shape[1:3]))
         distance = _lpips(last, self.image[None])
         solved = distance < self.threshold
         return Reward(reward=-distance, terminated=solved, success=solved)

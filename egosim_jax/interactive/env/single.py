@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsIndex, cast
 
 import gymnasium
 import numpy as np
@@ -25,8 +26,8 @@ from egosim_jax.interactive.env.chunks import (
     validity,
     view_of,
 )
-from egosim_jax.interactive.env.rewards import Outcome, RewardFn, no_reward
-from egosim_jax.simulation.actions import check_action
+from egosim_jax.interactive.env.rewards import Outcome, RewardFn, check_reward, no_reward
+from egosim_jax.io.bounded import quote
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.simulation.simulator import Step
 from egosim_jax.simulation.start import Start, check_size
@@ -39,6 +40,7 @@ FAR_M = 100.0
 """Depth of empty pixels and bound of observed positions, in meters."""
 OPTIONS = ("start", "episode", "state", "prompt")
 """Options of `reset`."""
+CLOSED = "The environment is closed: make a new one."
 
 
 def observation_space(video: VideoSpec, spec: ActionSpec, observe: tuple[str, ...]) -> spaces.Dict:
@@ -74,7 +76,7 @@ def start_from_options(
     `start` is a `Start`, `episode` an `Episode` or its path. `state` is a `SceneState` or its
     folder, seen by the seed's camera. `prompt` replaces the prompt.
     """
-    given = dict(options or {})
+    given = to_options(options)
     if unknown := sorted(given.keys() - set(OPTIONS)):
         raise InputError(
             f"There is no reset option {unknown[0]!r:.40}: choose from {', '.join(OPTIONS)}."
@@ -109,6 +111,32 @@ def _check_row(row: np.ndarray, spec: ActionSpec) -> None:
         ) from error
 
 
+def to_options(options: object) -> dict[str, Any]:
+    """Return the options of a reset. Raises `InputError` unless they are a map with text keys."""
+    given = {} if options is None else options
+    if not isinstance(given, Mapping) or not all(isinstance(key, str) for key in given):
+        raise InputError(
+            f"options is {quote(given)}: it must be a map from names to values, such as "
+            f"{', '.join(OPTIONS)}."
+        )
+    return dict(given)
+
+
+def seed_of(seed: object) -> int | None:
+    """Return a seed as Python's integer, or None. Raises `InputError` for any other value."""
+    if seed is None:
+        return None
+    try:
+        chosen = operator.index(cast(SupportsIndex, seed))
+    except TypeError:
+        raise InputError(
+            f"seed is {quote(seed)}: it must be a whole number, or in a vector environment a list "
+            "of one for each episode."
+        ) from None
+    check_seed(chosen, name="seed")
+    return chosen
+
+
 class RunningEpisode:
     """Episode in progress, with its position and last step."""
 
@@ -133,11 +161,7 @@ class RunningEpisode:
         Raises `InputError` for invalid rows and for cameras that the state does not allow.
         """
         video = self.backend.video
-        chunk = make_chunk(
-            self.actions, rows, start=self.now, frames=video.frames, prompt=prompt, hide=True
-        )
-        check_action(chunk.action, state=self.now.state, fps=video.fps, continued=True)
-        return chunk
+        return make_chunk(self.actions, rows, start=self.now, video=video, prompt=prompt)
 
     def simulate(self, chunk: Chunk) -> tuple[Step, dict[str, Any]]:
         """Return the step of a chunk and its metadata, without changing the episode."""
@@ -224,6 +248,7 @@ class WorldEnv(gymnasium.Env):
         self.action_space = spaces.Box(low, high, dtype=np.float64)
         self.observation_space = observation_space(backend.video, self.actions, self._observe)
         self._running: RunningEpisode | None = None
+        self._ended = self._closed = False
 
     @property
     def chunk(self) -> int:
@@ -238,21 +263,23 @@ class WorldEnv(gymnasium.Env):
         return self._running
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self, *, seed: SupportsIndex | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Begin an episode from a seed, or from the options of `start_from_options`."""
-        super().reset(seed=seed)
-        chosen = int(self.np_random.integers(2**31)) if seed is None else seed
-        check_seed(chosen, name="seed")
+        self._check_open()
+        given = seed_of(seed)
+        super().reset(seed=given)
+        chosen = int(self.np_random.integers(2**31)) if given is None else given
         start = start_from_options(self.backend, self.actions, seed=chosen, options=options)
-        self._running = RunningEpisode(self.backend, self.actions, start)
+        check_reward(self._reward, start)
+        self._running, self._ended = RunningEpisode(self.backend, self.actions, start), False
         return self.running.observation(self._observe), self.running.info()
 
     def step(
         self, action: Float[np.ndarray, " d"]
     ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Move to a row in a straight line, over a full chunk."""
-        (target,) = self.actions.check(np.asarray(action)[None], max_rows=1)
+        (target,) = self.actions.check([action], max_rows=1)
         return self.chunk_step(straight_path(self.running.row, target, self.chunk + 1))
 
     def chunk_step(
@@ -263,14 +290,26 @@ class WorldEnv(gymnasium.Env):
         `info` has the chunk number, padded frames, hidden hands, hash of the state, seconds of each
         phase, `validity` and `success`.
         """
+        self._check_open()
         running = self.running
+        if self._ended:
+            raise InputError("The episode has ended: reset it before the next step.")
         chunk = running.chunk(actions, prompt=prompt)
         step, known = running.simulate(chunk)
         result = self._reward(Outcome(first=running.start.state, step=step))
         info = {**running.advance(chunk, step), **known, "success": result.success}
         truncated = running.chunks >= self._max_chunks and not result.terminated
+        self._ended = result.terminated or truncated
         observation = running.observation(self._observe)
         return observation, result.reward, result.terminated, truncated, info
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise InputError(CLOSED)
+
+    def close(self) -> None:
+        """Refuse further resets and steps."""
+        self._closed = True
 
     def render(self) -> UInt8[np.ndarray, "h w 3"] | None:
         """Return the last frame."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any, SupportsIndex
@@ -16,10 +15,20 @@ from jaxtyping import Bool, Float
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import Backend
 from egosim_jax.interactive.env.chunks import straight_path
-from egosim_jax.interactive.env.rewards import Outcome, RewardFn, no_reward
-from egosim_jax.interactive.env.single import RunningEpisode, observation_space, start_from_options
-from egosim_jax.types import InputError, check_counts, check_seed
+from egosim_jax.interactive.env.rewards import Outcome, RewardFn, check_reward, no_reward
+from egosim_jax.interactive.env.single import (
+    CLOSED,
+    RunningEpisode,
+    observation_space,
+    seed_of,
+    start_from_options,
+    to_options,
+)
+from egosim_jax.io.bounded import quote
+from egosim_jax.types import InputError, check_counts
 
+Seeds = SupportsIndex | Sequence[SupportsIndex | None] | np.ndarray | None
+"""Seed of the first episode, or of each episode."""
 StepReturn = tuple[
     dict[str, Any],
     Float[np.ndarray, " n"],
@@ -86,7 +95,7 @@ class WorldVectorEnv(VectorEnv):
     def reset(
         self,
         *,
-        seed: SupportsIndex | Sequence[SupportsIndex | None] | None = None,
+        seed: Seeds = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Begin the episodes of `reset_mask`, or all; if one cannot begin, none does.
@@ -94,10 +103,13 @@ class WorldVectorEnv(VectorEnv):
         A single seed seeds episode 0; episode i uses seed + i. The other options are the options of
         `WorldEnv.reset`, for all episodes. `starts` gives one set of options per episode.
         """
-        given = dict(options or {})
+        self._check_open()
+        given = to_options(options)
         mask = np.asarray(given.pop("reset_mask", np.ones(self.num_envs, bool)), bool)
         starts = given.pop("starts", [given] * self.num_envs)
         seeds = self._seeds(seed)
+        if not isinstance(starts, list | tuple):
+            raise InputError(f"starts is {quote(starts)}: it must be a list of maps of options.")
         if mask.shape != (self.num_envs,) or {len(starts), len(seeds)} != {self.num_envs}:
             raise InputError(
                 f"reset_mask has shape {mask.shape}, starts has {len(starts)} entries and seed "
@@ -112,25 +124,26 @@ class WorldVectorEnv(VectorEnv):
             for number in chosen
         ]
         for number, start in zip(chosen, begun, strict=True):
+            check_reward(self._rewards[number], start)
+        for number, start in zip(chosen, begun, strict=True):
             self._running[number] = RunningEpisode(self.backend, self.actions, start)
         self._ended[mask] = False
         return self._observations(), self._infos([running.info() for running in self.running])
 
-    def _seeds(self, seed: SupportsIndex | Sequence[SupportsIndex | None] | None) -> list[int]:
+    def _seeds(self, seed: Seeds) -> list[int]:
         """Return the seed of each episode; missing seeds are drawn from `np_random`."""
-        several = isinstance(seed, Sequence)
-        given = [None if n is None else operator.index(n) for n in (seed if several else [seed])]
+        several = isinstance(seed, list | tuple) or (isinstance(seed, np.ndarray) and seed.ndim > 0)
+        given = [seed_of(number) for number in (seed if several else [seed])]
         known = [number for number in given if number is not None]
-        for number in known:
-            check_seed(number, name="seed")
         super().reset(seed=known[0] if known else None)
         seeds = [int(self.np_random.integers(2**31)) if n is None else n for n in given]
         return seeds if several else [seeds[0] + number for number in range(self.num_envs)]
 
     def step(self, actions: Float[np.ndarray, "n d"]) -> StepReturn:
         """Move each episode to a row in a straight line, over a full chunk."""
+        self._check_rows(actions)
         frames = self.chunk + 1
-        targets = [self.actions.check(np.asarray(row)[None], max_rows=1)[0] for row in actions]
+        targets = [self.actions.check([row], max_rows=1)[0] for row in actions]
         rows = [
             straight_path(r.row, target, frames)
             for r, target in zip(self.running, targets, strict=True)
@@ -144,16 +157,13 @@ class WorldVectorEnv(VectorEnv):
 
         If an action is invalid or a step fails, no episode changes. Reset a finished episode first.
         """
-        if len(actions) != self.num_envs:
+        self._check_rows(actions)
+        texts = [None] * self.num_envs if prompts is None else prompts
+        if not isinstance(texts, list | tuple) or len(texts) != self.num_envs:
             raise InputError(
-                f"There are {len(actions)} actions for {self.num_envs} episodes: give one for each."
+                f"prompts is {quote(texts)}: it must be a list of one for each of {self.num_envs} "
+                "episodes."
             )
-        if self._ended.any():
-            raise InputError(
-                f"Episode {int(np.argmax(self._ended))} has ended: reset it with the option "
-                "reset_mask before the next step."
-            )
-        texts = prompts or [None] * self.num_envs
         chunks = [
             running.chunk(rows, prompt=prompt)
             for running, rows, prompt in zip(self.running, actions, texts, strict=True)
@@ -180,6 +190,24 @@ class WorldVectorEnv(VectorEnv):
         truncated = (chunks_done >= self._max_chunks) & ~terminated
         self._ended = terminated | truncated
         return self._observations(), rewards, terminated, truncated, self._infos(infos)
+
+    def _check_open(self) -> None:
+        if self.closed:
+            raise InputError(CLOSED)
+
+    def _check_rows(self, actions: object) -> None:
+        """Raise `InputError` unless each episode can take a step, and has an action."""
+        self._check_open()
+        given = len(actions) if isinstance(actions, np.ndarray | list | tuple) else 0
+        if given != self.num_envs:
+            raise InputError(
+                f"There are {given} actions for {self.num_envs} episodes: give one for each."
+            )
+        if self._ended.any():
+            raise InputError(
+                f"Episode {int(np.argmax(self._ended))} has ended: reset it with the option "
+                "reset_mask before the next step."
+            )
 
     def _observations(self) -> dict[str, Any]:
         found = [running.observation(self._observe) for running in self.running]

@@ -24,6 +24,7 @@ from egosim_jax.interactive.env.chunks import straight_path, view_of
 from egosim_jax.interactive.play.moves import Pose, ready_pose, scene_from_state, suggest_goal
 from egosim_jax.interactive.server.session import Session
 from egosim_jax.rendering.mesh import Side
+from egosim_jax.simulation.actions import places_of
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.simulation.start import Start, check_size
 from egosim_jax.types import Action, Cameras, InputError, SceneState
@@ -140,7 +141,7 @@ class PlayedEpisode:
         """Make a clip of these hand poses, in which the camera moves to the given row.
 
         Moments after the current one are dropped. `show` gets each group of frames, and True with
-        the last group, before perception starts. Raises `InputError` for a hand out of view.
+        the last group, before perception starts. A hand out of view is hidden.
         """
         then, times, count = time.monotonic(), [], 0
         number, before = self.session.committed + 1, self.now
@@ -215,7 +216,7 @@ class PlayedEpisode:
     def _posed(self, hand: Pose, camera: Float[np.ndarray, " 6"]) -> Action:
         spec = self.session.actions
         row = np.clip(hand.row(self.side, camera), *spec.bounds)
-        return spec.to_action(row[None], camera=self.now.start.camera, prompt="", hide=True)[0]
+        return spec.to_action(row[None], camera=self.now.start.camera, prompt="")[0]
 
 
 def _true_scene(start: Start, world: GeneratedWorld) -> Scene | None:
@@ -229,7 +230,8 @@ def _true_scene(start: Start, world: GeneratedWorld) -> Scene | None:
 
 def _film(before: Future[Filmed], action: Action) -> Filmed:
     """Execute an action in the true world, and render it."""
-    scenes, world = before.result()[0].move(action)
-    arms = arms_of(action.joints_m, action.kind)
+    joints_m = places_of(action)
+    scenes, world = before.result()[0].move(action, joints_m=joints_m)
+    arms = arms_of(joints_m, action.kind)
     rendered = render_scenes(scenes, action.cameras, arms=arms)
     return world, np.stack([frame.colors for frame in rendered])

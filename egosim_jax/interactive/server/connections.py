@@ -2,8 +2,9 @@
 
 uvicorn reads a request however slowly it comes, and has no option against it. Here a connection
 that has no request under way is closed after `HEAD_S`, and one above the limit is refused before
-anything of it is read. This is the only module that knows the inside of uvicorn: it subclasses
-`H11Protocol`, whose names `tests/unit/interactive/server/test_connections.py` checks.
+anything of it is read. A websocket message above the limit is answered before its connection is
+closed. This is the only module that knows the inside of uvicorn: it subclasses `H11Protocol` and
+`WebSocketsSansIOProtocol`, whose names `tests/unit/interactive/server/test_connections.py` checks.
 """
 
 from __future__ import annotations
@@ -12,11 +13,19 @@ import json
 from typing import Any
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.exceptions import PayloadTooBig
+from websockets.frames import Frame, Opcode
 
 from egosim_jax.interactive.server.errors import RequestError
+from egosim_jax.interactive.server.guard import too_large
 
 HEAD_S = 20.0
 """Longest time that a connection takes for the head of a request, and is kept without one."""
+
+
+DISCARD_S = 5.0
+"""Longest time in which the rest of a too large message is read and discarded."""
 
 
 class BoundedProtocol(H11Protocol):
@@ -50,6 +59,28 @@ class BoundedProtocol(H11Protocol):
         if (timer := getattr(self, "_timer", None)) is not None:
             timer.cancel()
         super().connection_lost(exc)
+
+
+class BoundedWebsocket(WebSocketsSansIOProtocol):
+    """Websocket of uvicorn that answers a too large message before it closes."""
+
+    def data_received(self, data: bytes) -> None:
+        """Read data, or discard it after a message was refused."""
+        if self.conn.parser_exc is None:
+            super().data_received(data)
+
+    def handle_parser_exception(self) -> None:
+        """Send the error of a too large message, and close once the client has sent all of it."""
+        if not isinstance(self.conn.parser_exc, PayloadTooBig):
+            super().handle_parser_exception()
+            return
+        answer = Frame(Opcode.TEXT, json.dumps(too_large().body()).encode())
+        self.transport.write(answer.serialize(mask=False))
+        self.transport.write(b"".join(self.conn.data_to_send()))
+        self.close_sent = True
+        # closed with unread data, the connection is reset and the client never sees the answer
+        self.close_timer = self.loop.call_later(DISCARD_S, self.transport.close)
+        self.queue.put_nowait({"type": "websocket.disconnect", "code": 1009})
 
 
 def _full(limit: int) -> bytes:

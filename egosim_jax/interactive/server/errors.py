@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from typing import Any
 
 from egosim_jax.types import InputError
+
+STORAGE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES)
+"""System errors of a disk that takes no more data."""
 
 
 class RequestError(InputError):
@@ -22,12 +27,35 @@ class RequestError(InputError):
         return found
 
 
+def storage_failure(error: BaseException) -> str | None:
+    """Return the system's reason if an error or its cause is that files cannot be written.
+
+    C++ libraries raise other errors, which have the system's reason in their text.
+    """
+    seen: BaseException | None = error
+    while seen is not None:
+        for code in STORAGE:
+            reason = os.strerror(code)
+            if (isinstance(seen, OSError) and seen.errno == code) or reason in str(seen):
+                return reason
+        seen = seen.__cause__ or seen.__context__
+    return None
+
+
 def as_request_error(error: Exception) -> RequestError:
     """Convert an error for the client; an internal error reveals no details."""
     if isinstance(error, RequestError):
         return error
     if isinstance(error, InputError):
         return RequestError(422, "invalid", str(error))
+    if (reason := storage_failure(error)) is not None:
+        return RequestError(
+            507,
+            "storage",
+            f"{reason} on the disk of the server's sessions, so the request was not done and the "
+            "session is as before. Send it again when the disk has space and can be written to.",
+            retry_after_s=10.0,
+        )
     if isinstance(error, FloatingPointError):
         return RequestError(
             500,

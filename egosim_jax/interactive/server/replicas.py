@@ -165,11 +165,15 @@ class Entrance:
 
     def __init__(self, parts: Sequence[Any]):
         self._parts = parts
-        self.metrics, self.draining = Metrics(), False
+        self.metrics = Metrics()
 
     def __serve_build_asgi_app__(self) -> Any:
         """Return the application that Ray serves."""
         return make_app(self, token=os.environ.get("EGOSIM_TOKEN", "").strip() or None)
+
+    def problem(self) -> str:
+        """Return empty text: Ray itself starts a part again, and errors of a part are its own."""
+        return ""
 
     async def describe(self) -> dict[str, Any]:
         """Return the description of a part (identical on all) and the number of parts."""

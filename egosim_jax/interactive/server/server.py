@@ -25,7 +25,7 @@ from starlette.exceptions import HTTPException
 
 from egosim_jax.interactive.origins import is_loopback
 from egosim_jax.interactive.server import wire
-from egosim_jax.interactive.server.connections import BoundedProtocol
+from egosim_jax.interactive.server.connections import BoundedProtocol, BoundedWebsocket
 from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.interactive.server.guard import Guard, response, too_large, too_slow
 from egosim_jax.interactive.server.prometheus import Metrics
@@ -53,9 +53,8 @@ class Requests(Protocol):
     metrics: Metrics
     """Metrics of the requests."""
 
-    @property
-    def draining(self) -> bool:
-        """True if new requests are refused."""
+    def problem(self) -> str:
+        """Return why no request is accepted now, or empty text."""
         ...
 
     async def describe(self) -> dict[str, Any]:
@@ -137,9 +136,8 @@ def make_app(service: Requests, *, token: str | None = None) -> FastAPI:
 
     @app.get("/readyz", summary="The server accepts requests")
     async def readyz() -> PlainTextResponse:
-        if service.draining:
-            return PlainTextResponse("draining\n", status_code=503)
-        return PlainTextResponse("OK\n")
+        problem = await asyncio.to_thread(service.problem)
+        return PlainTextResponse(f"{problem or 'OK'}\n", status_code=503 if problem else 200)
 
     @app.get("/metrics", summary="Metrics in the Prometheus format")
     async def metrics() -> PlainTextResponse:
@@ -295,7 +293,7 @@ def serve(service: Service, bound: socket.socket, *, token: str | None, ready: A
         access_log=False,
         http=BoundedProtocol,
         limit_concurrency=service.store.limits.connections + 1,
-        ws="websockets-sansio",
+        ws=BoundedWebsocket,
         ws_max_size=wire.MAX_BYTES,
         ws_ping_interval=30.0,
         ws_ping_timeout=300.0,

@@ -31,6 +31,7 @@ from egosim_jax.interactive.server.requests import (
 from egosim_jax.interactive.server.session import Result, Session
 from egosim_jax.interactive.server.store import Limits, Store
 from egosim_jax.io.executables import share_with_jax
+from egosim_jax.runtime.memory import return_freed_blocks
 from egosim_jax.types import InputError
 
 T = TypeVar("T")
@@ -48,6 +49,10 @@ class Service:
     def draining(self) -> bool:
         """True if the server is shutting down and accepts no new requests."""
         return self.store.draining
+
+    def problem(self) -> str:
+        """Return why the server accepts no requests now, or empty text."""
+        return "draining" if self.draining else self.store.storage_problem()
 
     async def describe(self) -> dict[str, Any]:
         """Return the description that a client receives when it connects."""
@@ -224,6 +229,7 @@ def open_service(
 ) -> Service:
     """Load and compile a world, resume the sessions of a folder, and return the service."""
     share_with_jax()
+    return_freed_blocks()
     backend = load_backend(
         world, config=config, weights=weights, perception=perception, steps=steps, batch=batch
     )

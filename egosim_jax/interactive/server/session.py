@@ -5,6 +5,7 @@
     starts/first/             first start, if a reset before step 1 replaced starts/0
     steps/N/request.json      row of each frame, prompt, and hash of the request
     steps/N/action.npz        cameras and joints; with both files, the step is accepted
+    steps/N/action_hands.npz  joints of all hands, if one is out of view
     steps/N/rollout/          journal, clip and state (rollout.py)
     steps/N/info.json         metadata of the step; with this file, the step is committed
     saved/NAME/               starts that the client saved
@@ -34,14 +35,15 @@ from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.io.bounded import quote, quote_path, read_json
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.run import write_json
-from egosim_jax.simulation.actions import check_action, load_action, save_action
+from egosim_jax.simulation.actions import load_placed, save_placed
 from egosim_jax.simulation.rollout import Rollout, load_clip
 from egosim_jax.simulation.start import Start
 from egosim_jax.state import snapshot
 from egosim_jax.types import Action, Cameras, InputError, SceneState
 
 SETTINGS, CLOSED = "session.json", "closed.json"
-INFO, REQUEST, ACTION = "info.json", "request.json", "action.npz"
+INFO, REQUEST, ACTION = "info.json", "request.json", "action"
+ACTION_FILE = f"{ACTION}.npz"
 FIRST = "first"
 Show = Callable[[UInt8[np.ndarray, "g h w 3"]], None]
 """Callback for each decoded group of frames."""
@@ -105,7 +107,7 @@ class Session:
     def pending(self) -> bool:
         """Return True if the request of the next step is on disk."""
         folder = self._step(self.committed + 1)
-        return all((folder / name).exists() for name in (REQUEST, ACTION))
+        return all((folder / name).exists() for name in (REQUEST, ACTION_FILE))
 
     def _step(self, number: int) -> Path:
         return self.folder / "steps" / str(number)
@@ -116,7 +118,7 @@ class Session:
     def _drop(self, number: int) -> None:
         """Remove a step."""
         # these files first: after a crash here, no half of the step can be resumed
-        for name in (INFO, ACTION):
+        for name in (INFO, ACTION_FILE):
             (self._step(number) / name).unlink(missing_ok=True)
         shutil.rmtree(self._step(number), ignore_errors=True)
 
@@ -171,8 +173,9 @@ class Session:
     def action(self, number: int) -> Action:
         """Return the action of an accepted step."""
         request = self._request(number)
-        return load_action(
-            self._step(number) / ACTION,
+        return load_placed(
+            self._step(number),
+            ACTION,
             kind=self.actions.kind,
             size=(self.backend.video.height, self.backend.video.width),
             prompt=request["prompt"],
@@ -228,10 +231,13 @@ class Session:
                 f"Step {step_id} cannot follow step {self.committed}: step_id must be one more "
                 f"than the last committed step. Send step {self.committed + 1}.",
             )
-        video, now = self.backend.video, self.now
-        chunk = make_chunk(self.actions, rows, start=now, frames=video.frames, prompt=prompt)
-        check_action(chunk.action, state=now.state, fps=video.fps, continued=True)
-        self._accept(step_id, chunk, request)
+        video = self.backend.video
+        chunk = make_chunk(self.actions, rows, start=self.now, video=video, prompt=prompt)
+        try:
+            self._accept(step_id, chunk, request)
+        except OSError:
+            self._drop(step_id)
+            raise
         return self.finish(show)
 
     def _repeated(self, step_id: int, request: str) -> Result:
@@ -256,7 +262,7 @@ class Session:
             **chunk.info(self.actions),
         }
         write_json(folder / REQUEST, fields)
-        save_action(folder / ACTION, chunk.action)
+        save_placed(folder, ACTION, chunk.action)
 
     def finish(self, show: Show | None = None) -> Result:
         """Make and commit the accepted step, from its last finished phase.

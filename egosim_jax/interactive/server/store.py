@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import re
 import secrets
 import shutil
@@ -18,7 +20,7 @@ from typing import Any, TypeVar
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import Backend
-from egosim_jax.interactive.server.errors import RequestError, as_request_error
+from egosim_jax.interactive.server.errors import STORAGE, RequestError, as_request_error
 from egosim_jax.interactive.server.prometheus import Metrics
 from egosim_jax.interactive.server.requests import (
     check_integer,
@@ -36,7 +38,7 @@ from egosim_jax.interactive.server.session import (
     check_world,
     request_hash,
 )
-from egosim_jax.io.atomic import lock_folder
+from egosim_jax.io.atomic import atomic_write, lock_folder
 from egosim_jax.io.bounded import quote, quote_path
 from egosim_jax.runtime.terminal import printable
 from egosim_jax.simulation.episode import Episode
@@ -48,8 +50,12 @@ UNFINISHED = re.compile(r"starts|\.session\..*")
 """File names that a crash can leave while a session is created."""
 MAX_SEED = 2**63 - 1_000_000
 """Maximum seed of a session: the seed of a step is larger by up to the number of steps."""
+MIN_FREE_BYTES = 4 << 20
+"""Minimum free space on the disk of a server that is ready, in bytes; a step writes about 1 MiB."""
 REMOVED = ".removed-{}"
 """Name of a session's folder while it is deleted."""
+PROBE = ".probe"
+"""Name of a file that is written to know whether the disk has space."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,6 +97,7 @@ class Store:
         self.sessions: dict[str, Session] = {}
         self.damaged: dict[str, str] = {}
         self.draining = False
+        self._storage_failed = False
         self._reserved: set[str] = set()
         self._changing = threading.Lock()
         self._queued = 0
@@ -197,7 +204,7 @@ class Store:
         prompt = prompt_of(request)
         seed = 0 if (chosen := request.get("seed")) is None else check_integer(chosen, "seed")
         if not 0 <= seed <= MAX_SEED:
-            raise InputError(f"seed is {quote(seed)}: it must be from 0 to {MAX_SEED}.")
+            raise InputError(f"seed is {quote(seed)}: it must be from 0 to 2**63 - 1000000.")
         if (data := request.get("episode")) is not None:
             if not isinstance(data, bytes):
                 raise InputError(f"episode is {quote(data)}: it must be the bytes of a .zip.")
@@ -350,6 +357,9 @@ class Store:
             found = as_request_error(self._for_client(error))
             if found.code == "internal":
                 traceback.print_exc()
+            if found.code == "storage":
+                self._storage_failed = True
+                print(f"cannot write to {self.folder}: {found}", file=sys.stderr, flush=True)
             raise found from error
         finally:
             if changes is not None:
@@ -359,6 +369,25 @@ class Store:
                 self._queued -= 1
                 self.metrics.queued.set(self._queued)
             self.metrics.seconds.observe(time.monotonic() - then)
+
+    def storage_problem(self) -> str:
+        """Return why the folder takes no more data, or empty text.
+
+        After a request that could not be written, a file is written to know when it is possible.
+        """
+        try:
+            if shutil.disk_usage(self.folder).free < MIN_FREE_BYTES:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            if self._storage_failed:
+                with atomic_write(self.folder / PROBE) as temporary:
+                    temporary.write_bytes(bytes(MIN_FREE_BYTES))
+                (self.folder / PROBE).unlink()
+                self._storage_failed = False
+        except OSError as error:
+            if error.errno not in STORAGE:
+                raise
+            return os.strerror(error.errno)
+        return ""
 
     def _for_client(self, error: Exception) -> Exception:
         """Return the error without the path of the server's folder."""

@@ -3,8 +3,10 @@
 Our own code, because msgpack-numpy unpickles arrays of objects and has no limits for hostile input.
 
 An array is a map of `__ndarray__`, `data`, `dtype` and `shape`. A NumPy scalar is a map of
-`__npgeneric__`, `data` and `dtype`. Their keys are bytes. Nothing is unpickled: only numeric dtypes
-are read, and the shape must match the number of bytes.
+`__npgeneric__`, `data` and `dtype`. Their keys are bytes. msgpack-numpy of PyPI writes `nd` and
+`type` instead of `__ndarray__` and `dtype`, and a scalar as bytes; both are read, and arrays are
+sent with the keys of both. Nothing is unpickled: only numeric dtypes are read, and the shape must
+match the number of bytes.
 """
 
 from __future__ import annotations
@@ -74,7 +76,8 @@ def unpack(data: bytes, *, limit: int | None = None) -> Any:
     except (ValueError, TypeError, KeyError, msgpack.UnpackException, RecursionError) as error:
         raise InputError(
             "The message is not MessagePack with numeric arrays, in the format of "
-            f"openpi_client.msgpack_numpy: {quote_text(str(error) or type(error).__name__)}."
+            "openpi_client.msgpack_numpy or msgpack_numpy: "
+            f"{quote_text(str(error) or type(error).__name__)}."
         ) from error
     if limit is not None:
         _check_depth(value)
@@ -88,8 +91,10 @@ def _packed(value: Any) -> Any:
         data = np.ascontiguousarray(value).tobytes()
         return {
             b"__ndarray__": True,
+            b"nd": True,
             b"data": data,
             b"dtype": value.dtype.str,
+            b"type": value.dtype.str,
             b"shape": value.shape,
         }
     if isinstance(value, np.generic):
@@ -100,6 +105,12 @@ def _packed(value: Any) -> Any:
 def _unpacked(value: dict[Any, Any]) -> Any:
     if b"__ndarray__" in value:
         return _array(value.get(b"data"), value.get(b"dtype"), value.get(b"shape"))
+    if value.get(b"nd") is True:
+        return _array(value.get(b"data"), value.get(b"type"), value.get(b"shape"))
+    if b"nd" in value:
+        return _array(value.get(b"data"), value.get(b"type"), [])[()]
+    if b"complex" in value:
+        raise InputError("The message has a complex number: send real numbers.")
     if b"__npgeneric__" in value:
         number = value.get(b"data")
         if not isinstance(number, bool | int | float):
@@ -134,7 +145,10 @@ def _array(data: Any, dtype: Any, shape: Any) -> np.ndarray:
 
 def _dtype(name: Any) -> np.dtype:
     if not isinstance(name, str) or not DTYPES.fullmatch(name):
-        raise InputError(f"The dtype of an array is {quote(name)}: it must be of numbers or bool.")
+        raise InputError(
+            f"The dtype of an array is {quote(name)}: it must be of numbers or bool. Convert it by "
+            "np.asarray(rows, float)."
+        )
     return np.dtype(name)
 
 

@@ -140,28 +140,37 @@ def refusals(
         return (f"only {figures['registered']:.0%} of the frames were registered",)
     rules = [
         (figures["registered"] >= config.min_registered,
-         f"{figures['registered']:.0%} of the frames were registered, below "
-         f"{config.min_registered:.0%}"),
+         f"{unlike(100 * figures['registered'], 100 * config.min_registered)}% of the frames were "
+         f"registered, below {config.min_registered:.0%}"),
         (figures["gap"] <= config.max_gap,
          f"{figures['gap']:.0f} frames in a row, or at an end, were not registered"),
         (figures["depth_spread"] < config.max_depth_spread,
-         f"depth spreads by a factor of {figures['depth_spread']:.3g}, above "
+         f"depth spreads by a factor of "
+         f"{unlike(figures['depth_spread'], config.max_depth_spread)}, above "
          f"{config.max_depth_spread:g}"),
         (abs(figures["radial"]) < config.max_radial,
-         f"radial distortion is {figures['radial']:.2f}, above {config.max_radial:g}"),
+         f"radial distortion is {unlike(figures['radial'], config.max_radial)}, above "
+         f"{config.max_radial:g}"),
         (figures["angle_deg"] > config.min_angle_deg,
-         f"the median triangulation angle is {figures['angle_deg']:.2f} degrees, below "
+         f"the median triangulation angle is "
+         f"{unlike(figures['angle_deg'], config.min_angle_deg)} degrees, below "
          f"{config.min_angle_deg:g}"),
         (figures["step"] < config.max_step,
-         f"the longest step is {figures['step']:.3g} median steps, above {config.max_step:g}"),
+         f"the longest step is {unlike(figures['step'], config.max_step)} median steps, above "
+         f"{config.max_step:g}"),
         (calibrated or config.min_view_deg <= figures["view_deg"] <= config.max_view_deg,
-         f"the view is {figures['view_deg']:.0f} degrees wide, not {config.min_view_deg:g} to "
-         f"{config.max_view_deg:g}"),
+         f"the view is {_beyond(figures['view_deg'], config)} degrees wide: it must be from "
+         f"{config.min_view_deg:g} to {config.max_view_deg:g}"),
         (figures["shared"] >= config.min_shared,
          f"two neighboring frames share {figures['shared']:.0f} points, fewer than "
          f"{config.min_shared}"),
     ]  # fmt: skip
     return tuple(reason for passed, reason in rules if not passed)
+
+
+def _beyond(view_deg: float, config: GateConfig) -> str:
+    limits = config.min_view_deg, config.max_view_deg
+    return unlike(view_deg, min(limits, key=lambda limit: abs(limit - view_deg)))
 
 
 def _longest_gap(registered: Int32[np.ndarray, " r"], frames: int) -> int:

@@ -100,6 +100,43 @@ def test_a_hand_that_is_mirrored_in_many_frames_is_refused_unless_its_side_is_gi
     assert sides_checked(tmp_path, 4, side="right") == {"left": 0, "right": 4}
 
 
+@dataclass(frozen=True)
+class TwoHands:
+    """The stub's hand and a left one, which is visible and mirrored in some of nine frames."""
+
+    both: int
+    mirrored: int = 0
+
+    def __call__(self, frames):
+        hands = MirroredHands(0)(frames)
+        for values in (hands.joints_px, hands.joints_hand_m, hands.presence):
+            values[: self.both, LEFT] = values[: self.both, RIGHT]
+        hands.mirrored[: self.mirrored, LEFT] = True
+        return hands
+
+
+@pytest.mark.parametrize(
+    ("hands", "side", "message"),
+    [
+        (TwoHands(9), "left", r"two are visible in 100% of the frames.*Omit it\. \(--side\)"),
+        (TwoHands(5), "right", r"two are visible in 55\.6%"),
+        (TwoHands(9, mirrored=9), "auto", r"the left hand .* 100% of.*\(--clips, --num-frames\)"),
+        (MirroredHands(9), "auto", r"Give the side if there is one hand\. \(--side\)"),
+    ],
+    ids=["side of two", "side of two in half", "mirrored of two", "mirrored of one"],
+)
+def test_the_advice_about_a_side_fits_the_number_of_hands(tmp_path, hands, side, message):
+    settings = config(side=side)
+    record = stages_of(tmp_path, config(), last="hands")
+    parts = replace(settings.build(), hands=hands)
+    with pytest.raises(RefusedError, match=message):
+        find_hands(record, parts, settings)
+    advised = "auto" if side != "auto" else "right"
+    if hands.mirrored if isinstance(hands, TwoHands) else False:
+        return  # its advice is another part of the video
+    assert find_hands(record, parts, config(side=advised)).hands is not None
+
+
 def test_the_background_is_judged_where_the_prior_draws_it(tmp_path):
     record = stages_of(tmp_path, config())
     state = record.require("state")

@@ -31,7 +31,7 @@ def test_a_streamed_clip_is_the_generated_one_in_groups_of_its_latent_frames():
     spec = ActionSpec()
     start = tabletop_start(0, spec, VIDEO)
     rows = np.repeat(spec.rest[None], VIDEO.frames, axis=0)
-    action, _ = spec.to_action(rows, camera=start.camera, prompt="rest", hide=True)
+    action, _ = spec.to_action(rows, camera=start.camera, prompt="rest")
     view = generator.renderer.render(start.state, action.cameras, point_px=2)
     shown = list(streamer.stream(view, action, start.first_frame, 3))
     assert [len(frames) for frames in shown] == [1, 4, 4]

@@ -70,7 +70,7 @@ def test_a_start_of_the_past_continues_to_the_same_state():
 def follow(start, *paths):
     """Start after some chunks, and the last chunk, without rendering."""
     for rows in paths:
-        chunk = make_chunk(WIDE, rows, start=start, frames=VIDEO.frames, hide=True)
+        chunk = make_chunk(WIDE, rows, start=start, video=VIDEO)
         start = start.after(start.state, chunk.rows[-1], chunk.action)
     return start, chunk
 

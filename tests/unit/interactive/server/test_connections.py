@@ -1,6 +1,7 @@
 """Connections that are slow, and the names of uvicorn that closing them needs."""
 
 import asyncio
+import json
 import operator
 import socket
 from importlib.metadata import version
@@ -10,9 +11,45 @@ import pytest
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.server import ServerState
+from websockets.exceptions import ConnectionClosedError
 
-from egosim_jax.interactive.server import connections
+from egosim_jax.interactive.server import connections, wire
+from egosim_jax.interactive.server.client import Client
 from tests.unit.interactive.server.served import run
+
+
+@pytest.mark.parametrize("size", [wire.MAX_BYTES + 1, 17 << 20, 48 << 20])
+@pytest.mark.parametrize("text", [False, True], ids=["bytes", "text"])
+def test_a_too_large_message_is_answered_before_its_connection_is_closed(server, size, text):
+    with Client(f"ws://127.0.0.1:{server[1]}") as client:
+        client._socket.send("x" * size if text else bytes(size))
+        error = json.loads(client._socket.recv(timeout=30))
+        assert (error["status"], error["code"]) == (413, "too_large")
+        assert "16,777,216 bytes" in error["message"]
+        with pytest.raises(ConnectionClosedError) as closed:
+            client._socket.recv(timeout=30)
+        assert closed.value.rcvd.code == 1009
+
+
+def test_the_limit_itself_is_accepted_and_the_server_goes_on(server):
+    with Client(f"ws://127.0.0.1:{server[1]}") as client:
+        client._socket.send(bytes(wire.MAX_BYTES))
+        assert json.loads(client._socket.recv(timeout=30))["code"] == "invalid"
+        assert client.request("status")["damaged"] == []
+
+
+@pytest.mark.parametrize(
+    "name", ["close_sent", "close_timer", "conn", "loop", "queue", "transport"]
+)
+def test_the_websocket_of_uvicorn_has_the_names_that_are_used(name):
+    async def get() -> None:
+        config = uvicorn.Config(lambda *_: None, log_config=None)
+        protocol = connections.WebSocketsSansIOProtocol(config, ServerState(), {})
+        assert hasattr(protocol, name)
+        assert hasattr(protocol.conn, "parser_exc")
+        assert callable(protocol.handle_parser_exception)
+
+    asyncio.run(get())
 
 
 @pytest.mark.parametrize(

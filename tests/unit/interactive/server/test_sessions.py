@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
+from egosim_jax.interactive.env.single import WorldEnv
 from egosim_jax.interactive.env.true_world import TrueWorld
 from egosim_jax.interactive.server import session as session_module
 from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.interactive.server.session import Session
 from egosim_jax.interactive.server.store import Limits, Store
+from egosim_jax.simulation.actions import places_of
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.types import InputError
 from tests.painted import VIDEO, painted
@@ -332,15 +334,38 @@ def test_an_invalid_action_is_refused_with_rule_and_value(store, change, message
     assert step(store, made, 1).step_id == 1
 
 
-def test_an_action_out_of_view_is_refused(store):
-    made = store.create({"actions": {"workspace_m": [[-9, -9, -9], [9, 9, 9]]}})
-    behind = made.actions.rest + 8 * np.eye(7)[1] * -1
-    assert step(store, made, 1, behind[None]).step_id == 1  # it begins in view
-    with pytest.raises(RequestError, match="view") as refused:
-        step(store, made, 2, behind[None])
-    assert refused.value.status == 422
-    store.reset({"session": made.id}).result()
-    assert step(store, made, 2).step_id == 2
+PARKED = {"layout": "wrist", "workspace_m": [[-9, -9, -9], [9, 9, 9]]}
+
+
+@pytest.mark.parametrize(
+    ("actions", "hidden"),
+    [
+        ({}, ["right"]),
+        ({"layout": "gripper"}, ["right"]),
+        ({"sides": ["left", "right"]}, ["left"]),
+        ({"sides": ["left"], "layout": "gripper", "camera": True}, ["left"]),
+    ],
+    ids=["hand", "gripper", "one of two", "gripper and camera"],
+)
+def test_a_hand_out_of_view_is_hidden_as_in_an_environment(store, actions, hidden):
+    made = store.create({"seed": 3, "actions": {**PARKED, **actions}})
+    row = made.actions.rest.copy()
+    row[1] -= 8
+    env = WorldEnv(store.backend, actions=made.actions)
+    env.reset(seed=3)
+    for number, expected in ((1, []), (2, hidden)):  # the first clip begins in view
+        found = step(store, made, number, row[None])
+        *_, info = env.chunk_step(row[None])
+        assert found.info["hidden_hands"] == info["hidden_hands"] == expected
+    again = Session(made.folder, store.backend)
+    joints = made.action(2).joints_m
+    assert np.isnan(joints[:, 0]).all()
+    np.testing.assert_array_equal(again.action(2).joints_m, joints)
+    np.testing.assert_array_equal(places_of(again.action(2))[-1], made.actions.joints(row[None])[0])
+    nan = np.where(np.arange(len(row)) < 7, np.nan, row)
+    with pytest.raises(RequestError, match="Give a hand that is out of view its last place"):
+        step(store, made, 3, nan[None])
+    assert step(store, made, 3, row[None]).step_id == 3  # the advice
 
 
 def test_a_second_store_of_a_folder_is_refused(store):

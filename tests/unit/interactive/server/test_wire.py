@@ -54,6 +54,82 @@ def test_a_message_of_too_many_items_is_refused(item, monkeypatch):
         wire.unpack(b"\xdd\x00\xff\xff\xff" * 3, limit=wire.MAX_BYTES)
 
 
+def pypi(value):
+    """What msgpack_numpy.encode 0.4.8 of PyPI returns for a value that msgpack does not know."""
+    if isinstance(value, np.ndarray):
+        structured = value.dtype.kind in "VO"
+        return {
+            b"nd": True,
+            b"type": value.dtype.descr if structured else value.dtype.str,
+            b"kind": value.dtype.kind.encode() if structured else b"",
+            b"shape": value.shape,
+            b"data": b"pickled" if value.dtype.kind == "O" else value.tobytes(),
+        }
+    if isinstance(value, complex):
+        return {b"complex": True, b"data": repr(value)}
+    return {b"nd": False, b"type": value.dtype.str, b"data": value.data}
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        np.arange(6.0).reshape(2, 3),
+        np.asfortranarray(np.arange(6, dtype=np.float32).reshape(2, 3)),
+        np.arange(6.0).reshape(2, 3)[:, ::2],
+        np.arange(4, dtype=">i2"),
+        np.array([True, False]),
+        np.zeros((0, 7)),
+        np.array(2.5),
+        np.float32(2.5),
+        np.bool_(True),
+        np.int64(-3),
+    ],
+    ids=lambda value: f"{type(value).__name__} {value.dtype.str} {value.shape}",
+)
+def test_messages_of_pypis_msgpack_numpy_are_read(value):
+    data = msgpack.packb({"a": {"b": [value]}}, default=pypi)
+    found = wire.unpack(data, limit=wire.MAX_BYTES)["a"]["b"][0]
+    assert (type(found), found.dtype) == (type(value), value.dtype)
+    np.testing.assert_array_equal(found, value)
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (np.array([{}]), "dtype of an array is a list of 1: it must be of numbers"),
+        (np.zeros(2, [("x", "f8")]), "must be of numbers"),
+        (np.zeros(2, complex), "must be of numbers"),
+        (np.array(["text"]), "must be of numbers"),
+        (1j, "complex number: send real numbers"),
+    ],
+    ids=["object", "structured", "complex array", "text", "complex"],
+)
+def test_other_arrays_of_pypis_msgpack_numpy_are_refused(value, message):
+    with pytest.raises(InputError, match=message):
+        wire.unpack(msgpack.packb({"a": value}, default=pypi), limit=wire.MAX_BYTES)
+
+
+@pytest.mark.parametrize(
+    "changed", [{b"shape": [3]}, {b"data": b"1234567"}, {b"shape": None}, {b"type": "<f9"}], ids=str
+)
+def test_damaged_arrays_of_pypis_msgpack_numpy_are_refused(changed):
+    data = msgpack.packb({"a": {**pypi(np.zeros(2)), **changed}})
+    with pytest.raises(InputError):
+        wire.unpack(data, limit=wire.MAX_BYTES)
+
+
+def test_pypis_msgpack_numpy_reads_our_arrays():
+    def decode(value):
+        if b"nd" in value:  # as in msgpack_numpy.decode
+            assert value[b"nd"] is True
+            return np.ndarray(value[b"shape"], np.dtype(value[b"type"]), value[b"data"])
+        return value
+
+    array = np.arange(6, dtype=np.uint8).reshape(2, 3)
+    found = msgpack.unpackb(wire.pack({"a": array}), object_hook=decode)
+    np.testing.assert_array_equal(found["a"], array)
+
+
 def test_a_large_message_is_refused_by_its_size():
     with pytest.raises(InputError, match="at most 10"):
         wire.unpack(bytes(11), limit=10)

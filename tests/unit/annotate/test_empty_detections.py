@@ -1,0 +1,206 @@
+"""Estimators that find nothing, or something in one frame: a result or a named rule, no IndexError.
+
+Each stage of an annotation, and each function below it, gets no hands, no points or no depth.
+"""
+
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from egosim_jax.annotate.clip import Job, annotate
+from egosim_jax.annotate.prepare import RefusedError
+from egosim_jax.annotate.scene import to_triplet
+from egosim_jax.annotate.sources import Source, open_source
+from egosim_jax.annotate.stages import drop_flashes, hold_hands, visible
+from egosim_jax.io.bounded import read_json
+from egosim_jax.perception.classical import ClassicalConfig
+from egosim_jax.perception.depth import SweptDepth
+from egosim_jax.perception.depth.triangulate import triangulate_frames
+from egosim_jax.perception.estimates import CameraEstimate, HandTracks, SparsePoints, Verdict
+from egosim_jax.perception.hands import LandmarkHands, lift
+from egosim_jax.perception.plate import clean_plate
+from egosim_jax.perception.silhouettes import track_silhouettes
+from egosim_jax.types import Action, Cameras, Clip, InputError
+from tests.hands import PaintedHands, hand_px, paint
+from tests.unit.annotate.stubs import StubDepth, StubHands, config, textured_video, write
+from tests.unit.annotate.test_stages import stages_of
+
+SHAPE = (9, 48, 80)
+NOWHERE = np.zeros(SHAPE, bool)
+
+
+def still_cameras(shift=0.0):
+    poses = np.tile(np.eye(4), (SHAPE[0], 1, 1))
+    poses[:, 0, 3] = shift * np.arange(SHAPE[0])
+    return Cameras(
+        world_from_camera=poses,
+        intrinsics_px=np.array([[50.0, 0, 39.5], [0, 50, 23.5], [0, 0, 1]]),
+        height=48,
+        width=80,
+    )
+
+
+@pytest.mark.parametrize("frames", [0, 1, 2], ids=["no hand", "one frame", "two frames"])
+@pytest.mark.parametrize("side", ["auto", "left"])
+def test_all_stages_run_on_few_hands(tmp_path, frames, side):
+    settings = config(side=side, hands_until=frames / 9)
+    settings = replace(settings, cutting=_without_rule(settings.cutting))
+    record = stages_of(tmp_path, settings)
+    seen = visible(record.require("hands"))
+    assert seen.sum() == frames
+    triplet, figures = to_triplet(record, settings)
+    assert triplet.hands.any() == (frames > 0)
+    assert np.isfinite(list(figures.values())).all()
+    assert "hand" in record.require("prompt")
+
+
+def _without_rule(cutting):
+    return replace(cutting, quality=replace(cutting.quality, min_hands=0.0))
+
+
+@pytest.mark.parametrize("until", [0.0, 1 / 9], ids=["no hand", "one frame"])
+def test_a_clip_with_too_few_hands_is_refused_by_the_rule(tmp_path, until):
+    path = write(tmp_path / "cup.mp4", np.repeat(textured_video(1), 9, axis=0))
+    open_source(Source(name="cup", path=path)).save(tmp_path / "cup")
+    job = Job(video_id="cup", recording=str(tmp_path / "cup"), start=0, stop=9, figures={})
+    settings = config(hands_until=until)
+    assert annotate(job, tmp_path / "out", settings, settings.build()) == "refused"
+    about = read_json(tmp_path / "out/cup/annotation.json")
+    assert about["rule"] == "hands"
+    assert f"visible in {round(9 * until)} of 9 frames" in about["reason"]
+
+
+@dataclass(frozen=True)
+class NoDepth(StubDepth):
+    """Depth that is unknown everywhere, or known in one pixel."""
+
+    known: int = 0
+
+    def __call__(self, frames, moving, estimate, wanted):
+        found = super().__call__(frames, moving, estimate, wanted)
+        depth = np.full_like(found.depth_m, np.inf)
+        depth.reshape(len(wanted), -1)[:, : self.known] = 2.0
+        return replace(found, depth_m=depth, confident=np.isfinite(depth))
+
+
+@pytest.mark.parametrize("known", [0, 1])
+@pytest.mark.parametrize("state", ["first", "fused"])
+def test_a_clip_without_depth_is_refused_with_a_reason(tmp_path, known, state, monkeypatch):
+    settings = config(state=state)
+    parts = replace(settings.build(), depth=NoDepth(None, known))
+    monkeypatch.setattr(type(settings), "build", lambda self: parts)
+    try:
+        record = stages_of(tmp_path, settings)
+    except (InputError, RefusedError) as error:
+        assert known == 0
+        assert "depth" in str(error)
+    else:
+        assert len(record.require("state").points_m) == 1
+
+
+class Blind(PaintedHands):
+    """Networks that find no palm, or a palm without a hand."""
+
+    def __init__(self, palm):
+        super().__init__()
+        self.palm = palm
+
+    def palms(self, image):
+        return super().palms(image) if self.palm else (
+            np.zeros((2016, 18), np.float32), np.full(2016, -50, np.float32)
+        )  # fmt: skip
+
+    def landmarks(self, image):
+        joints, _, right, meters = super().landmarks(image)
+        return joints, 0.0, right, meters
+
+
+@pytest.mark.parametrize("frames", [1, 2, 5])
+@pytest.mark.parametrize("networks", [Blind(False), Blind(True)], ids=["no palm", "no hand"])
+def test_networks_that_find_nothing_give_tracks_without_hands(frames, networks):
+    video = paint([[hand_px(center=(160, 120))]] * frames)
+    tracks = LandmarkHands(networks=networks)(video)
+    assert tracks.joints_px.shape == (frames, 2, 21, 2)
+    assert not visible(tracks).any()
+    assert not (tracks.presence.any() or tracks.filled.any() or tracks.mirrored.any())
+
+
+@pytest.mark.parametrize("shown", [0, 1, 4])
+def test_a_hand_in_one_frame_of_several_is_a_false_detection(shown):
+    hands = [[hand_px(center=(160, 120))] if number == shown else [] for number in range(5)]
+    assert not visible(LandmarkHands(networks=PaintedHands())(paint(hands))).any()
+
+
+def test_a_hand_in_a_video_of_one_frame_is_found():
+    tracks = LandmarkHands(networks=PaintedHands())(paint([[hand_px(center=(160, 120))]]))
+    assert visible(tracks).sum() == 1
+
+
+@pytest.mark.parametrize("frames", [1, 2, 9])
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda hands: drop_flashes(hands, Fraction(16)).presence,
+        lambda hands: hold_hands(hands, Fraction(16)).presence,
+        lambda hands: lift(hands, still_cameras().intrinsics_px)[..., 0, 0] > 0,
+        lambda hands: track_silhouettes(
+            np.zeros((len(hands.presence), 48, 80, 3), np.uint8), hands
+        ),
+    ],
+    ids=["flashes", "hold", "lift", "silhouettes"],
+)
+def test_functions_of_tracks_take_tracks_without_hands(function, frames):
+    empty = HandTracks(
+        joints_px=np.full((frames, 2, 21, 2), np.nan),
+        joints_hand_m=np.full((frames, 2, 21, 3), np.nan),
+        presence=np.zeros((frames, 2)),
+    )
+    assert not function(empty).any()
+
+
+@pytest.mark.parametrize("hidden", [False, True], ids=["flat", "hidden"])
+def test_frames_without_corners_have_no_points_and_an_assumed_depth(hidden):
+    frames = np.full((*SHAPE, 3), 128, np.uint8)
+    moving = NOWHERE | hidden
+    cameras = still_cameras(0.02)
+    assert triangulate_frames(frames, moving, cameras, [0, 4]) is None
+    for points in (None, _no_points()):
+        verdict = Verdict(rung="given", reason="given", figures={})
+        estimate = CameraEstimate(cameras=cameras, metric=True, verdict=verdict, points=points)
+        found = SweptDepth()(frames, moving, estimate, [0, 4])
+        assert np.isfinite(found.depth_m).all()
+        assert "0 points" in found.reason or "does not change" in found.reason
+
+
+def _no_points():
+    return SparsePoints(
+        points_m=np.zeros((0, 3)),
+        error_px=np.zeros(0),
+        frames=np.zeros(0, np.int32),
+        indices=np.zeros(0, np.int32),
+        pixels_px=np.zeros((0, 2)),
+    )
+
+
+@pytest.mark.parametrize("moving", [NOWHERE, ~NOWHERE], ids=["no hand", "only hands"])
+@pytest.mark.parametrize("depth_m", [2.0, np.inf])
+def test_a_plate_of_nothing_or_everything_hidden(moving, depth_m):
+    frames = textured_video(9, shift=0)
+    plate = clean_plate(frames, moving, still_cameras(), np.full(SHAPE[1:], depth_m))
+    assert plate.image.shape == frames[0].shape
+    assert not plate.seen.any()
+
+
+@pytest.mark.parametrize("frames", [0, 1], ids=["no hand", "one frame"])
+def test_perception_of_a_clip_without_hands_moves_nothing(frames, tmp_path):
+    state = stages_of(tmp_path, config(hands_until=1.0)).require("state")
+    joints = np.full((9, 1, 21, 3), np.nan)
+    video = np.repeat(textured_video(1), 9, axis=0)
+    if frames:
+        local = lift(StubHands(1 / 9, None)(video), still_cameras().intrinsics_px)
+        joints[:frames, 0] = local[:frames, 1]
+    action = Action(cameras=still_cameras(), joints_m=joints, kind="human", prompt="look")
+    found = ClassicalConfig().build()(Clip(frames=video, fps=16), action, state)
+    assert not found.world_from_object

@@ -1,0 +1,136 @@
+"""Wrong calls of both environments: each is refused with a message, and changes nothing."""
+
+import numpy as np
+import pytest
+
+from egosim_jax.interactive.env.action_spec import ActionSpec
+from egosim_jax.interactive.env.rewards import GoalImage, MoveObject
+from egosim_jax.interactive.env.single import WorldEnv, seed_of, to_options
+from egosim_jax.interactive.env.vector import WorldVectorEnv
+from egosim_jax.types import InputError
+from tests.painted import painted
+
+REST = ActionSpec().rest
+
+
+def make(count, **options):
+    """An environment of one episode, or a vector environment."""
+    return WorldVectorEnv(painted(), count, **options) if count else WorldEnv(painted(), **options)
+
+
+def rows(env, count):
+    return np.tile(REST, (count, 1, 1) if count else (1, 1))
+
+
+@pytest.mark.parametrize("count", [0, 2], ids=["single", "vector"])
+@pytest.mark.parametrize("seed", [-1, 1 << 63, np.int64(-3), np.array(-1)], ids=repr)
+def test_a_seed_out_of_bounds_is_refused(count, seed):
+    with pytest.raises(InputError, match=r"from 0 to 2\*\*63 - 1"):
+        make(count).reset(seed=seed)
+
+
+@pytest.mark.parametrize("seed", [1.5, "3", np.float64(3), np.array([3, 4]), [3], b"3"], ids=repr)
+def test_a_seed_that_is_no_whole_number_is_refused(seed):
+    with pytest.raises(InputError, match="must be a whole number"):
+        seed_of(seed)
+
+
+@pytest.mark.parametrize("seed", [np.array([3, 4]), (3, np.int64(4)), [3, 4]], ids=type)
+def test_seeds_of_a_vector_environment_may_be_any_sequence(seed):
+    env = make(2)
+    env.reset(seed=seed)
+    assert [running.start.seed for running in env.running] == [3, 4]
+
+
+def test_a_seed_of_numpy_is_taken_by_a_single_environment():
+    env = make(0)
+    env.reset(seed=np.int64(3))
+    assert env.running.start.seed == 3
+
+
+@pytest.mark.parametrize("count", [0, 2], ids=["single", "vector"])
+def test_an_ended_episode_takes_no_step_until_it_is_reset(count):
+    env = make(count, max_chunks=1)
+    env.reset(seed=3)
+    assert np.all(env.chunk_step(rows(env, count))[3])
+    for step, action in (
+        (env.chunk_step, rows(env, count)),
+        (env.step, rows(env, count)[..., 0, :]),
+    ):
+        with pytest.raises(InputError, match="has ended: reset it"):
+            step(action)
+    env.reset(seed=3)
+    env.chunk_step(rows(env, count))
+
+
+@pytest.mark.parametrize("count", [0, 2], ids=["single", "vector"])
+def test_a_closed_environment_refuses_every_call(count):
+    env = make(count)
+    env.reset(seed=3)
+    env.close()
+    env.close()
+    calls = [
+        lambda: env.reset(seed=3),
+        lambda: env.chunk_step(rows(env, count)),
+        lambda: env.step(rows(env, count)[..., 0, :]),
+    ]
+    for call in calls:
+        with pytest.raises(InputError, match="is closed: make a new one"):
+            call()
+
+
+@pytest.mark.parametrize("given", [0, 1, 3])
+def test_a_vector_environment_needs_an_action_for_each_episode(given):
+    env = make(2)
+    env.reset(seed=3)
+    for step, action in ((env.step, REST), (env.chunk_step, REST[None])):
+        with pytest.raises(InputError, match=f"{given} actions for 2 episodes: give one for each"):
+            step(np.tile(action, (given, *[1] * action.ndim)))
+
+
+@pytest.mark.parametrize("count", [0, 2], ids=["single", "vector"])
+@pytest.mark.parametrize("row", [REST[:6], np.append(REST, 0), REST + 9, REST + np.nan], ids=len)
+def test_a_row_that_is_no_row_is_refused(count, row):
+    env = make(count)
+    env.reset(seed=3)
+    with pytest.raises(InputError, match="he actions"):
+        env.step(np.stack([row] * count) if count else row)
+
+
+@pytest.mark.parametrize("prompts", ["ab", ["a"], ["a"] * 3, []], ids=str)
+def test_a_vector_environment_needs_a_prompt_for_each_episode(prompts):
+    env = make(2)
+    env.reset(seed=3)
+    with pytest.raises(InputError, match="one for each of 2 episodes"):
+        env.chunk_step(rows(env, 2), prompts=prompts)
+
+
+@pytest.mark.parametrize("options", ["state", 3, {3: 4}, [("prompt", "a")]], ids=str)
+def test_options_that_are_no_map_are_refused(options):
+    with pytest.raises(InputError, match="must be a map"):
+        to_options(options)
+
+
+@pytest.mark.parametrize("count", [0, 2], ids=["single", "vector"])
+@pytest.mark.parametrize(
+    ("reward", "message"),
+    [
+        (
+            MoveObject(number=99, offset_m=(0.1, 0.0, 0.0)),
+            "Object 99 has no points.*info\\['objects'\\]",
+        ),
+        (MoveObject(number=0, offset_m=(0.1, 0.0, 0.0)), "Object 0 has no points"),
+        (GoalImage(image=np.zeros((8, 8, 3), np.uint8)), "goal image"),
+    ],
+    ids=["unknown", "background", "size"],
+)
+def test_a_reward_that_cannot_judge_the_episode_is_refused_at_its_reset(count, reward, message):
+    env = make(count, reward=reward)
+    with pytest.raises(InputError, match=message):
+        env.reset(seed=3)
+
+
+def test_the_advice_about_an_unknown_object_works():
+    numbers = make(0).reset(seed=3)[1]["objects"]
+    for number in numbers:
+        make(0, reward=MoveObject(number=number, offset_m=(0.1, 0.0, 0.0))).reset(seed=3)
