@@ -274,8 +274,10 @@ class FromClips(FromScratch):
         from egosim_jax.data.clips import write_clips
         from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 
-        spec = replace(configs.get(self.config).video, frames=self.clip_frames)
-        made = (to_triplet(next(make_sequence(seed, spec=spec))) for seed in range(self.clips))
+        model = configs.get(self.config)
+        spec = replace(model.video, frames=self.clip_frames)
+        scenes = (next(make_sequence(seed, spec=spec)) for seed in range(self.clips))
+        made = (to_triplet(scene, point_px=model.point_px) for scene in scenes)
         splits = ({"split": "test" if n % 4 == 3 else "train"} for n in range(self.clips))
         clips = (replace(clip, extra=extra) for clip, extra in zip(made, splits, strict=True))
         write_clips(folder, clips, fps=spec.fps)

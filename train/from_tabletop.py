@@ -104,6 +104,7 @@ class FromTabletop(FromScratch):
             attempts=self.attempts if split == "train" else 0.0,
             prior="static" if self.twins else "state",
             hands="mesh" if self.twins else "skeleton",
+            point_px=model.point_px,
         )
         frames = out / "frames" / split
         workers, states = os.cpu_count() or 1, true_states

@@ -26,6 +26,7 @@ from egosim_jax.annotate.stages import (
 from egosim_jax.evaluation.metrics.image import decibels
 from egosim_jax.geometry import invert, pixel_rays, pixels_of, transform
 from egosim_jax.perception.estimates import DepthEstimate, Rung
+from egosim_jax.rendering import POINT_PX
 from egosim_jax.rendering.reference import splat
 from egosim_jax.state.depth import state_from_depth
 from egosim_jax.types import SceneState, Triplet
@@ -34,8 +35,6 @@ PLATE_MARGIN = 1 / 80
 """Width of the border around hands that is replaced, too, as a fraction of the image width."""
 FRAMES_AT_ONCE = 64
 """Number of frames that are rendered together."""
-POINT_PX = 2
-"""Size in pixels of the points of a prior."""
 
 
 def find_scale(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:

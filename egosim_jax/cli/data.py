@@ -219,6 +219,8 @@ class Make:
     """Maximum number of black cloths on a table, which look like holes in the prior."""
     attempts: float = 0.0
     """Fraction of scenes with a policy that may fail and head turns, not a script."""
+    point_px: int = 1
+    """Side of the points of a rendered prior in pixels; must be the model's."""
     fixed_camera: bool = False
     """Keep the camera at its first pose."""
     prior: Literal["state", "static"] = "state"
@@ -248,6 +250,7 @@ class Make:
             attempts=self.attempts,
             prior=self.prior,
             hands=self.hands,
+            point_px=self.point_px,
             fixed_camera=self.fixed_camera,
         )
         progress = make_shards(config, out=self.out, workers=self.workers, grid=_grid(self.config))

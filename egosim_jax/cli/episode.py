@@ -266,7 +266,7 @@ class ShowEpisode:
         from egosim_jax import rendering
 
         renderer = rendering.get(self.renderer)
-        view = renderer.render(state, action.cameras, point_px=2)
+        view = renderer.render(state, action.cameras, point_px=rendering.POINT_PX)
         hands, depth_m = renderer.draw_hands(action.joints_m, action.cameras, kind=action.kind)
         return np.where((depth_m < view.depth_m)[..., None], hands, view.frames)
 

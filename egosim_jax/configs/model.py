@@ -38,6 +38,7 @@ from egosim_jax.models.layers import init_sharded
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
 from egosim_jax.models.wan.umt5 import UMT5Config
 from egosim_jax.models.wan.vae import WanVAEConfig
+from egosim_jax.rendering import POINT_PX
 from egosim_jax.types import InputError, Triplet, VideoGrid, VideoSpec, check_counts
 
 Name = Literal["dit", "vae", "text", "image"]
@@ -69,6 +70,8 @@ class ModelConfig:
     Training and generation both use them, unless a triplet has `tokens`."""
     layout: ChannelLayout = field(default_factory=ChannelLayout)
     """Input channels of the denoiser."""
+    point_px: int = POINT_PX
+    """Side of the points of a rendered prior in pixels, in training and in generation."""
     tokenizer: PromptTokenizer = field(default_factory=PromptTokenizer)
     """Tokenizer of the prompts."""
     encoders: Literal["frozen", "joint"] = "frozen"
@@ -99,6 +102,7 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         """Check that networks, input channels and video fit each other."""
+        check_counts({"point_px": self.point_px})
         dit, layout, latents = self.dit, self.layout, self.vae.latent_channels
         pairs = [
             ("dit.text_dim", dit.text_dim, "text.dim", self.text.dim),

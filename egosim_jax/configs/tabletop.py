@@ -30,7 +30,8 @@ CONFIG = ModelConfig(
     text=UMT5Config(vocab=BYT5_VOCAB, dim=64, ffn_dim=128, heads=2, head_dim=32, layers=2),
     image=CLIPVisionConfig(image_size=56, dim=64, layers=3, heads=2, ffn_dim=128),
     tokenizer=PromptTokenizer(kind="byt5", max_tokens=96),
+    point_px=1,
     encoders="joint",
     process=RectifiedFlow(shift=3.0),
-    steps=4,
+    steps=2,
 )

@@ -94,7 +94,7 @@ def run(settings: Embodiment) -> None:
     open_folder(settings.out, record, mutable=["experiment.out", "experiment.weights"])
     trained = experiment.train_all()
     scenes = [
-        HeldOutClip.make(seed, experiment.model.video, "robot")
+        HeldOutClip.make(seed, experiment.model.video, "robot", point_px=experiment.model.point_px)
         for seed in track(experiment.unseen, "making held-out scenes", total=settings.held_out)
     ]
     videos = experiment.generate_all(trained, scenes)

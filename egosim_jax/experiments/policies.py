@@ -27,7 +27,7 @@ from egosim_jax.runtime.progress import track
 from egosim_jax.state.fuse import fuse
 from egosim_jax.types import Action, Cameras, Clip, SceneState, Triplet, VideoSpec, check_counts
 from egosim_jax.worlds.tabletop import Scene, Script, World, make_scripts
-from egosim_jax.worlds.tabletop.clips import POINT_PX, Arm, paints_of, place, render_scenes
+from egosim_jax.worlds.tabletop.clips import Arm, paints_of, place, render_scenes
 from egosim_jax.worlds.tabletop.policies import MAX_ERROR_M, POLICIES, goal_error_m, succeeded
 from egosim_jax.worlds.tabletop.world import arms_of
 
@@ -186,7 +186,7 @@ def _videos(task: Task, generator: Generator, size: int, folder: Path) -> Videos
 def _generate(task: Task, generator: Generator, size: int) -> Videos:
     """Generate the clip of every policy from the same noise."""
     first, state = World(scene=task.script.scene).observe(task.script.cameras)
-    view = generator.renderer.render(state, task.script.cameras, point_px=POINT_PX)
+    view = generator.renderer.render(state, task.script.cameras, point_px=generator.point_px)
     triplets = [
         Triplet(
             video_id=f"{task.seed} {policy.name}",

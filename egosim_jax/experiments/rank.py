@@ -86,7 +86,7 @@ def _goal(settings: Rank, generator: Generator, seed: int) -> dict:
 
 def _triplet(clip: TabletopClip, generator: Generator) -> Triplet:
     prior, hands = conditions_of(generator.config)
-    return to_triplet(clip, prior=prior, hands=hands)
+    return to_triplet(clip, prior=prior, hands=hands, point_px=generator.point_px)
 
 
 def candidates(seed: int, spec: VideoSpec, number: int) -> list[TabletopClip]:

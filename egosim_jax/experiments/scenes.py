@@ -16,7 +16,7 @@ from egosim_jax.evaluation.metrics.report import score
 from egosim_jax.generation.generator import Generator, batches
 from egosim_jax.types import Kind, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, to_triplet
-from egosim_jax.worlds.tabletop.clips import HandsName, PriorName
+from egosim_jax.worlds.tabletop.clips import POINT_PX, HandsName, PriorName
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND
 
 DroppedCondition = Literal["prior", "mask", "hands"]
@@ -68,6 +68,7 @@ class HeldOutClip:
         fixed_camera: bool = False,
         prior: PriorName = "state",
         hands: HandsName = "skeleton",
+        point_px: int = POINT_PX,
     ) -> HeldOutClip:
         """Make the first clip of a scene."""
         scene = partial(
@@ -79,7 +80,8 @@ class HeldOutClip:
             fixed_camera=fixed_camera,
         )
         clip, bare = next(scene()), next(scene(bare=True))
-        return cls(clip, to_triplet(clip, prior=prior, hands=hands), bare.frames)
+        triplet = to_triplet(clip, prior=prior, hands=hands, point_px=point_px)
+        return cls(clip, triplet, bare.frames)
 
     def evaluate(self, video: np.ndarray) -> dict[str, float]:
         """Return all measures of a video of this clip."""

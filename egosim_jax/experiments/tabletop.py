@@ -106,7 +106,13 @@ def run(settings: Tabletop) -> None:
 def _make_scenes(settings: Tabletop, kind: Kind, config: ModelConfig) -> list[HeldOutClip]:
     seeds = range(settings.first_scene, settings.first_scene + settings.scenes)
     prior, hands = conditions_of(config)
-    make = partial(HeldOutClip.make, black_cloths=settings.black_cloths, prior=prior, hands=hands)
+    make = partial(
+        HeldOutClip.make,
+        black_cloths=settings.black_cloths,
+        prior=prior,
+        hands=hands,
+        point_px=config.point_px,
+    )
     return [
         make(seed, config.video, kind)
         for seed in track(seeds, f"making {kind} scenes", total=settings.scenes)

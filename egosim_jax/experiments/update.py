@@ -76,7 +76,7 @@ def _rows(
     large = next(make_sequence(seed, spec=LARGE))
     yield f"oracle, {LARGE.width} x {LARGE.height}", evaluate(large, large.frames, "oracle")
     clip = next(make_sequence(seed, spec=spec))
-    view = render(clip.state, clip.cameras, point_px=2)
+    view = render(clip.state, clip.cameras, point_px=generator.point_px)
     generated = generator(view, to_action(clip), clip.first.colors, seed)
     yield f"oracle, {spec.width} x {spec.height}", evaluate(clip, clip.frames, "oracle")
     yield "classical, ground-truth frames", evaluate(clip, clip.frames, "classical")

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from egosim_jax.data.clips import write_clips
-from egosim_jax.rendering import Renderer, jitted
+from egosim_jax.rendering import POINT_PX, Renderer, jitted
 from egosim_jax.rendering.hand_mesh import pose_hands
 from egosim_jax.rendering.mesh import MovingMesh
 from egosim_jax.rendering.mesh_reference import draw_scene
@@ -16,9 +16,6 @@ from egosim_jax.simulation.actions import check_order
 from egosim_jax.state.ply import has_triangles, read_triangles
 from egosim_jax.state.snapshot import load, read_ply
 from egosim_jax.types import Action, Cameras, InputError, SceneState, Triplet, check_video
-
-POINT_PX = 2
-"""Size of the points of a rendered prior, in pixels."""
 
 
 def write_conditions(
@@ -30,14 +27,16 @@ def write_conditions(
     video_id: str = "clip_1",
     first_frame: UInt8[np.ndarray, "h w 3"] | None = None,
     renderer: Renderer = jitted,
+    point_px: int = POINT_PX,
 ) -> Path:
     """Write prior, mask and hand videos of an action in EgoSim's layout; return its metadata.csv.
 
     Rows of other clips in the folder stay; a clip of the same `video_id` is replaced.
-    The first frame defaults to the view's. Raises `InputError` if the first camera sees none
+    `point_px` is the side of a point, which must be the model's. The first frame defaults to the
+    view's. Raises `InputError` if the first camera sees none
     of the state, and for a `video_id` that is not a valid file name.
     """
-    view = renderer.render(state, action.cameras, point_px=POINT_PX)
+    view = renderer.render(state, action.cameras, point_px=point_px)
     triplet = Triplet(
         video_id=video_id,
         prompt=action.prompt,

@@ -154,6 +154,11 @@ class Generator:
             cache_key=("decode", config),
         )
 
+    @property
+    def point_px(self) -> int:
+        """Side of the points of a prior in pixels."""
+        return self.config.point_px
+
     @classmethod
     def load(
         cls,

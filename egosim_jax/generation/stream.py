@@ -38,6 +38,7 @@ class Streamer:
     def __init__(self, generator: Generator):
         """Stream a generator's clips; if its VAE is not causal, all frames are one group."""
         self.renderer = generator.renderer
+        self.point_px = generator.point_px
         self._generator = generator
         vae = generator.networks.vae
         self._next = (

@@ -23,6 +23,9 @@ from egosim_jax.types import Cameras, Kind, SceneState, View
 
 RendererName = Literal["jax", "numpy"]
 
+POINT_PX = 2
+"""Default side of a drawn point in pixels, as in EgoSim's renderer."""
+
 
 @runtime_checkable
 class Renderer(Protocol):

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from egosim_jax.perception import Perception
-from egosim_jax.rendering import Renderer, reference
+from egosim_jax.rendering import POINT_PX, Renderer, reference
 from egosim_jax.state.fuse import fuse
 from egosim_jax.state.tsdf import Fusion
 from egosim_jax.types import Action, Clip, InputError, SceneState, View
@@ -25,7 +25,11 @@ from egosim_jax.types import Action, Clip, InputError, SceneState, View
 
 @runtime_checkable
 class VideoGenerator(Protocol):
-    """Function that generates the video of an action."""
+    """Function that generates the video of an action.
+
+    Its attributes `renderer` and `point_px`, if it has them, replace the NumPy renderer and the
+    default side of a point in pixels.
+    """
 
     def __call__(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
@@ -67,8 +71,6 @@ class Simulator:
     """Perception that reconstructs the clips in 3D; None keeps the state unchanged."""
     fps: int
     """Frame rate of the clips, in frames per second."""
-    point_px: int = 2
-    """Point size in the view, in pixels; must be the size that the generator was trained with."""
     fusion: Fusion = field(default_factory=Fusion)
     """Settings of the fusion."""
     show: Callable[[UInt8[np.ndarray, "g h w 3"]], None] | None = None
@@ -78,6 +80,11 @@ class Simulator:
     def renderer(self) -> Renderer:
         """Renderer of the view: the generator's own, or the NumPy reference."""
         return getattr(self.generator, "renderer", reference)
+
+    @property
+    def point_px(self) -> int:
+        """Side of a point of the view in pixels: the generator's own, or the default."""
+        return getattr(self.generator, "point_px", POINT_PX)
 
     def step(
         self,

@@ -30,6 +30,7 @@ class BatchGenerator(VideoGenerator, Protocol):
     """Generator of several clips in one program (`generation.stream.Streamer`)."""
 
     renderer: Renderer
+    point_px: int
 
     def condition(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"]
@@ -91,6 +92,7 @@ class Batcher:
                 f"give a multiple of {unit}. (--batch)"
             )
         self.renderer = generator.renderer
+        self.point_px = generator.point_px
         self._generator = generator
         self.sizes = [unit]
         # powers of two keep the number of programs to compile small

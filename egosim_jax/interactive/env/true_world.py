@@ -32,6 +32,7 @@ from egosim_jax.types import (
     View,
 )
 from egosim_jax.worlds.tabletop import TabletopClip, World, start_of_sequence, to_ground_truth
+from egosim_jax.worlds.tabletop.clips import POINT_PX
 
 MAX_CACHED_WORLDS = 256
 """Maximum number of cached worlds; without a cache each step repeats its episode from the start."""
@@ -135,6 +136,7 @@ class _TrueGenerator:
 
     execution: _Execution
     renderer: ModuleType = jitted
+    point_px: int = POINT_PX
 
     def __call__(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int

@@ -26,6 +26,8 @@ class _Unavailable:
 
     renderer: Any
     """Renderer of the views."""
+    point_px: int
+    """Side of a point of the views in pixels."""
 
     def __call__(self, view: View, action: Action, first_frame: Any, seed: int) -> Any:
         raise InputError("A recorded session cannot continue here: use egosim serve.")
@@ -68,12 +70,19 @@ def open_sessions(folder: Path, names: Sequence[str] = ()) -> tuple[list[Session
 
 def _recorded(path: Path) -> GeneratedWorld:
     """Return a world that renders a recorded session, and does not generate."""
-    fields = settings_of(path).get("video")
+    settings = settings_of(path)
+    fields, point_px = settings.get("video"), settings.get("point_px")
     names = ("frames", "height", "width", "fps")
-    if not isinstance(fields, dict) or not all(type(fields.get(n)) is int for n in names):
+    if (
+        not isinstance(fields, dict)
+        or not all(type(fields.get(n)) is int for n in names)
+        or type(point_px) is not int
+        or point_px < 1
+    ):
         raise InputError(f"{quote_path(path)} does not describe a session's clips. Restore it.")
     video = VideoSpec(**{name: fields[name] for name in names})
-    return GeneratedWorld(generator=_Unavailable(renderer=get("jax")), video=video, perception=None)
+    generator = _Unavailable(renderer=get("jax"), point_px=point_px)
+    return GeneratedWorld(generator=generator, video=video, perception=None)
 
 
 def to_lerobot(sessions: Sequence[Session], folder: Path) -> None:

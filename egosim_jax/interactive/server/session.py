@@ -92,6 +92,7 @@ class Session:
         settings = {
             "actions": actions.to_json(),
             "video": backend.video,
+            "point_px": backend.simulator(start).point_px,
             "seed": start.seed,
             "world": backend.identity(),
         }

@@ -39,8 +39,8 @@ from egosim_jax.worlds.tabletop.scene import FIRST_BODY, FIRST_HAND, Scene
 
 POINTS_PER_PIXEL = 2
 """Points along each side of a first-frame pixel, in the state of a clip."""
-POINT_PX = 2
-"""Rendered size of the points of a state in pixels."""
+POINT_PX = 1
+"""Default side of the points of a rendered prior in pixels: the size for `tabletop`."""
 
 PriorName = Literal["state", "static"]
 """Rendering of the scene: points of a state, or the scene as it was in the first frame."""
@@ -225,16 +225,18 @@ def to_triplet(
     *,
     prior: PriorName = "state",
     hands: HandsName = "skeleton",
+    point_px: int = POINT_PX,
 ) -> Triplet:
     """Return the clip in EgoSim's format, with a rendering of the scene and of the hands.
 
+    `point_px` is the side of a point in pixels, which must be the model's.
     By default the state is the clip's own and the first frame is ray cast. A given state, such as
     the updated state of the clip before, also renders the first frame, holes included. A `static`
     prior is observed everywhere: its mask is 0. Hands and objects may leave the view. Raises
     `InputError` if the first frame shows no point, or for the mesh of a gripper.
     """
     # A static prior does not need this view, but every prior refuses a clip without points.
-    view = render(state or clip.state, clip.cameras, point_px=POINT_PX)
+    view = render(state or clip.state, clip.cameras, point_px=point_px)
     frames, mask = view.frames, view.mask
     first = clip.first.colors if state is None else frames[0]
     if prior == "static":

@@ -26,10 +26,12 @@ from egosim_jax.types import (
     SceneState,
     VideoGrid,
     VideoSpec,
+    check_counts,
     check_seed,
 )
 from egosim_jax.worlds.tabletop.attempts import make_attempts
 from egosim_jax.worlds.tabletop.clips import (
+    POINT_PX,
     HandsName,
     PriorName,
     TabletopClip,
@@ -62,6 +64,8 @@ class DatasetConfig:
     """Rendering of the scene: points of the state, or the ray-cast scene of the first frame."""
     hands: HandsName = "skeleton"
     """Rendering of the hands: skeletons, shaded meshes, or the meshes' binary mask."""
+    point_px: int = POINT_PX
+    """Side of the points of a rendered prior in pixels; must be the model's."""
     fixed_camera: bool = False
     """True: the camera keeps its pose of the first frame."""
 
@@ -96,6 +100,7 @@ class DatasetConfig:
                 "both must be at least 1. (--scenes, --clips)"
             )
         check_seed(min(self.seeds))
+        check_counts({"--point-px": self.point_px})
         if not 0 <= self.attempts <= 1:
             raise InputError(
                 f"{self.attempts:g} is not a fraction of the scenes: it must be between 0 and 1. "
@@ -179,7 +184,9 @@ def _make(config: DatasetConfig, seed: int, parts: Path, states: States) -> None
     clips = list(config.clips_of(seed))
     for clip, state in zip(clips, states(clips), strict=True):
         with atomic_write(_part(parts, seed, clip.number)) as temporary:
-            triplet = to_triplet(clip, state, prior=config.prior, hands=config.hands)
+            triplet = to_triplet(
+                clip, state, prior=config.prior, hands=config.hands, point_px=config.point_px
+            )
             temporary.write_bytes(to_bytes(triplet_record(triplet)))
 
 

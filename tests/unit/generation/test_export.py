@@ -8,13 +8,14 @@ from egosim_jax.data.metadata import read_metadata
 from egosim_jax.generation.export import write_conditions
 from egosim_jax.types import InputError, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_action, to_triplet
+from egosim_jax.worlds.tabletop.clips import POINT_PX
 
 SPEC = VideoSpec(frames=5, height=48, width=80, fps=8)
 
 
 def test_the_files_are_read_as_the_clip_of_the_same_action(tmp_path):
     clip = next(make_sequence(3, spec=SPEC))
-    path = write_conditions(tmp_path, clip.state, to_action(clip), fps=8)
+    path = write_conditions(tmp_path, clip.state, to_action(clip), fps=8, point_px=POINT_PX)
     (files,) = read_metadata(path)
     loaded, expected = load_triplet(files, SPEC), to_triplet(clip)
     assert loaded.prompt == expected.prompt
@@ -40,7 +41,7 @@ def test_an_id_outside_the_folder_is_refused(tmp_path):
 
 def test_a_table_with_other_columns_is_refused(tmp_path):
     clip = next(make_sequence(3, spec=SPEC))
-    path = write_conditions(tmp_path, clip.state, to_action(clip), fps=8)
+    path = write_conditions(tmp_path, clip.state, to_action(clip), fps=8, point_px=POINT_PX)
     header, row = path.read_text().splitlines()
     table = f"{header},split\n{row},test\n"
     path.write_text(table)

@@ -52,7 +52,9 @@ def test_without_a_first_frame_the_generator_gets_that_of_the_view(clip):
 
 
 class Marked:
-    """A generator with a renderer."""
+    """A generator with a renderer and a point size."""
+
+    point_px = 3
 
     renderer = SimpleNamespace(
         render=lambda state, cameras, *, point_px: replace(
@@ -72,3 +74,12 @@ def test_the_view_is_drawn_by_the_renderer_of_the_generator(clip):
     assert plain.renderer is reference
     drawn = Simulator(generator=Marked(), perception=None, fps=8)
     assert (drawn.render(clip.state, to_action(clip)).object_ids == 99).all()
+
+
+def test_points_have_the_size_that_the_generator_names(clip):
+    plain = Simulator(generator=copy_the_view, perception=None, fps=8)
+    assert plain.point_px == 2
+    assert Simulator(generator=Marked(), perception=None, fps=8).point_px == 3
+    view = Simulator(generator=Marked(), perception=None, fps=8).render(clip.state, to_action(clip))
+    expected = reference.render(clip.state, clip.cameras, point_px=3)
+    np.testing.assert_array_equal(view.frames, expected.frames)

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
+from egosim_jax import configs
 from egosim_jax.data.shards import ShardReader
-from egosim_jax.rendering.reference import splat
+from egosim_jax.rendering.reference import render, splat
 from egosim_jax.types import InputError, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
-from egosim_jax.worlds.tabletop.clips import hand_video, static_video
+from egosim_jax.worlds.tabletop.clips import POINT_PX, hand_video, static_video
 from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND
 
@@ -17,6 +18,18 @@ SPEC = VideoSpec(frames=5, height=48, width=80)
 @pytest.fixture(scope="module")
 def clips():
     return list(make_sequence(3, spec=SPEC, clips=2))
+
+
+def test_the_world_draws_points_as_its_model_wants_them():
+    assert configs.get("tabletop").point_px == POINT_PX
+
+
+def test_a_prior_has_points_of_the_given_size():
+    clip = next(make_sequence(3, spec=SPEC))
+    for size in (1, 2):
+        view = render(clip.state, clip.cameras, point_px=size)
+        np.testing.assert_array_equal(to_triplet(clip, point_px=size).prior, view.frames)
+        np.testing.assert_array_equal(to_triplet(clip, point_px=size).mask, view.mask)
 
 
 def test_the_static_video_starts_as_the_clip_without_hands(clips):
