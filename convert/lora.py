@@ -182,7 +182,7 @@ def _names(
 ) -> tuple[list[Name], list[str]]:
     """Return the names of the tensors of one LoRA, and why others cannot be of it.
 
-    As in `egosim convert weights`, what is outside the prefix of the network is skipped, with a
+    As in `egosim convert weights`, tensors outside the prefix of the network are skipped, with a
     message. So is the base of a checkpoint that was saved with its LoRA.
     """
     keys = [key for key in source.tensors if not TEXT.search(key)]
@@ -261,7 +261,9 @@ def _translated(
             f"{listing(problems)}."
         )
     tensors = {name.key: source.tensors[name.key] for name in names}
-    refuse([f"{k}: has values that are not finite" for k, t in tensors.items() if not _sound(t)])
+    refuse(
+        [f"{k}: has values that are not finite" for k, t in tensors.items() if not _is_finite(t)]
+    )
     linear = {at: pair for at, pair in pairs.items() if at.rule.transform == "linear"}
     changes: dict[str, Change] = {}
     for path in dict.fromkeys(location.path for location in linear):
@@ -334,7 +336,7 @@ def _pair(
         alpha = finite(float(tensor.array().item()), f"The alpha of {location}")
     if why := settings.misfit(roles["down"].layer, rank, alpha):
         raise InputError(
-            f"{settings.source} is not of {source.name}: {why}. Give it the file of its own "
+            f"{settings.source} is not of {source.name}: {why}. Give it the file of its "
             f"adapter, or move {source.name} to a folder without one."
         )
     return Pair(down, up, settings.scale(alpha, rank))
@@ -348,7 +350,7 @@ def _shape(location: Location, shape: tuple[int, ...]) -> tuple[int, ...]:
         return shape
 
 
-def _sound(tensor: Tensor) -> bool:
+def _is_finite(tensor: Tensor) -> bool:
     """Return True if all values of a tensor are finite."""
     return all_finite(tensor.array())
 

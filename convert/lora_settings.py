@@ -101,7 +101,7 @@ def settings_of(path: Path, file: Path, metadata: Mapping[str, str]) -> Settings
         if file.stem != ADAPTER_STEM and others:
             raise InputError(
                 f"{quote_path(adapter)} belongs to {quote_path(others[0].name)}, not to "
-                f"{quote_path(file.name)}: move one of the two LoRAs to a folder of its own."
+                f"{quote_path(file.name)}: move one of the two LoRAs to another folder."
             )
         return _peft(read_json(adapter), source=quote_path(adapter))
     if ADAPTER_ENTRY in metadata:

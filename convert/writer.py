@@ -59,7 +59,7 @@ class Weight:
     names: tuple[str, ...] = ()
     """Name of each piece in error messages; empty for the weight's own name."""
     fix: str = "Store the weights as bfloat16 or float32, or omit the option. (--dtype)"
-    """What to do about values beyond the range of `dtype`, for an error message."""
+    """Fix of values beyond the range of `dtype`, for an error message."""
 
     @property
     def bytes(self) -> int:

@@ -1,4 +1,4 @@
-"""What a model without weights says, and a checkpoint or run that is given as weights."""
+"""Models without weights, and checkpoints and runs that are given as weights."""
 
 import dataclasses
 import shlex

@@ -107,7 +107,7 @@ def test_a_setting_of_the_scale_is_applied(tmp_path, settings, rank, scale):
         ),
     ],
 )
-def test_settings_of_another_adapter_beside_the_file_are_refused(
+def test_settings_of_another_adapter_next_to_the_file_are_refused(
     tmp_path, settings, tensors, why, capsys
 ):
     folder = adapter(tmp_path / "a", tensors, **settings)

@@ -92,7 +92,7 @@ def test_layers_of_integers_and_numbers_are_no_stack(tmp_path, capsys):
 
 @pytest.mark.parametrize("prefix", ["", "text_encoder.", "model.t5."])
 @pytest.mark.parametrize("name", ["dwm_tabletop", "debug"])
-def test_inspect_tells_t5_from_umt5(name, prefix, tmp_path, capsys):
+def test_inspect_distinguishes_t5_and_umt5(name, prefix, tmp_path, capsys):
     """They have the same names, but T5 has a position bias in its first block alone."""
     config = configs.get(name).text
     rng = np.random.default_rng(0)
