@@ -52,8 +52,10 @@ MAX_CLIP_BYTES, MAX_SHEET_BYTES = 1 << 24, 1 << 27
 """Maximum size of a sample video, which the page omits beyond it, and of a contact sheet."""
 MAX_METRICS_BYTES, MAX_STEP, MAX_VALUE = 1 << 27, 1 << 53, 1e100
 """Maximum size of metrics.jsonl, number of a step, and absolute value in a curve."""
-MAX_PLOTS, MAX_ROWS, MAX_CELL, MAX_DEPTH = 60, 2000, 1000, 32
-"""Maximum number of plots and of rows of a table, length of a cell, and depth of a value."""
+MAX_PLOTS, MAX_CURVES, MAX_LABEL = 60, 12, 12
+"""Maximum number of plots and of curves of a plot, and length of their labels."""
+MAX_ROWS, MAX_CELL, MAX_DEPTH = 2000, 1000, 32
+"""Maximum number of rows of a table, length of a cell, and depth of a value."""
 _HEAD = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8">
 <meta http-equiv="Content-Security-Policy"
@@ -213,7 +215,10 @@ def draw_curves(plots: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
-    plots = dict(islice(plots.items(), MAX_PLOTS))
+    plots = {
+        title: dict(islice(curves.items(), MAX_CURVES))
+        for title, curves in islice(plots.items(), MAX_PLOTS)
+    }
     last = max(int(steps.max()) for curves in plots.values() for steps, _ in curves.values()) or 1
     columns = min(3, len(plots))
     rows = -(-len(plots) // columns)
@@ -223,7 +228,9 @@ def draw_curves(plots: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]
         for kind, (steps, values) in curves.items():
             x, y = _downsample(steps, np.where(np.abs(values) < MAX_VALUE, values, np.nan))
             mark, color = "o" if len(x) < 30 else None, COLORS.get(kind)
-            plot.plot(x, y, marker=mark, markersize=3, linewidth=1.2, label=kind, color=color)
+            plot.plot(
+                x, y, marker=mark, markersize=3, linewidth=1.2, label=kind[:MAX_LABEL], color=color
+            )
         finite = np.concatenate([y[np.abs(y) < MAX_VALUE] for _, y in curves.values()])
         if len(finite) and finite.min() > 1 / MAX_VALUE and finite.max() > 10 * finite.min():
             plot.set_yscale("log")

@@ -212,9 +212,13 @@ def quote_text(text: str) -> str:
 
 
 def plot_text(text: str) -> str:
-    """Return a title for matplotlib, which would read text between dollar signs as formulas."""
+    """Return a title for matplotlib, which would read text between dollar signs as formulas.
+
+    Its font has Latin, Greek and Cyrillic letters.
+    """
     cut = text[:MAX_QUOTED] + ("…" if len(text) > MAX_QUOTED else "")
-    return printable(cut.replace("\n", " ")).replace("$", r"\$")
+    known = (c if c < "\u0500" or c == "…" else ascii(c)[1:-1] for c in cut.replace("\n", " "))
+    return printable("".join(known)).replace("$", r"\$")
 
 
 def own_file(folder: Path, name: str) -> Path | None:

@@ -41,7 +41,7 @@ def nerfstudio(folder, world):
         frames.append({"file_path": f"images/{number}.npy", "transform_matrix": pose.tolist()})
     fields = {"fl_x": 9, "fl_y": 9, "cx": 4, "cy": 4, "w": 8, "h": 8, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(fields))
-    return Nerfstudio(source=folder, fps=30)
+    return Nerfstudio(source=folder, fps=30.0)
 
 
 def taste_rob(folder, world):

@@ -151,9 +151,9 @@ def test_a_small_file_that_expands_is_refused_within_a_gigabyte(tmp_path, monkey
         close(child)
 
     monkeypatch.setattr(isolated.Child, "close", measure)
-    wanted = {"x": (None, None)}  # a name is enough for Parquet
+    hdf5 = path.suffix == ".h5"
     with pytest.raises(InputError, match=path.name):
-        (read_hdf5 if path.suffix == ".h5" else read_parquet)(path, wanted)
+        read_hdf5(path, {"x": (None, None)}) if hdf5 else read_parquet(path, ["x"])
     isolated._READER.close()
     (peak,) = re.findall(r"VmHWM:\s+(\d+) kB", peaks[0])
     assert int(peak) < 1 << 20
