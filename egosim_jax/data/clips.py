@@ -37,6 +37,7 @@ from egosim_jax.io.bounded import listing, quote, quote_path, quote_text, read_b
 from egosim_jax.io.decoding import Damage, Decoding
 from egosim_jax.io.images import MAX_IMAGE_BYTES, read_image
 from egosim_jax.io.run import write_text
+from egosim_jax.io.timing import CONVERT
 from egosim_jax.io.video import VideoInfo, probe_video, read_video, write_video
 from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import WAN_GRID, InputError, Triplet, VideoGrid, VideoSpec
@@ -149,7 +150,7 @@ def check_clip(
         sizes["first_frame"] = _read_first_frame(files.first_frame).shape[:2]
     except InputError as error:
         problems.append(str(error))
-    if resampling == "rate":
+    if resampling == "rate" or policy == "strict":
         problems += _rate_problems(probed)
     if policy == "strict":
         taken = _taken(probed, spec, resampling)
@@ -267,8 +268,9 @@ def _rate_problems(probed: dict[str, VideoInfo]) -> list[str]:
         return []
     return [
         f"the frame rates disagree: {_table({n: f'{float(r):g}' for n, r in rates.items()})}. "
-        "Frames taken by rate need one rate: write all videos at one, or use another rule. "
-        "(--resampling)"
+        "Frame k of each must be of one time. Write all at one rate, for instance with "
+        f"`{CONVERT.format(f'{float(min(rates.values())):.6g}')}`, which keeps times, or `ffmpeg "
+        f"-r {float(min(rates.values())):.6g} -i IN OUT`, which keeps frames."
     ]
 
 

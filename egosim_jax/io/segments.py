@@ -106,8 +106,10 @@ def _read(
     try:
         frames = _decode(file, name, listing, key, stamps, each)
     except DamagedError as error:
+        if key == first and listing.cut:
+            raise listing.undecodable(name) from error
         if key == first:
-            raise listing.undecodable(name) if listing.cut else error from error
+            raise
         # An open GOP may tell the decoder to forget frames that it knows only from the beginning.
         file.seek(0)
         try:

@@ -87,8 +87,13 @@ class Timeline:
         count = int(float(self.times_s[-1]) * float(fps) + _EPSILON_S) + 1
         return self.nearest(np.arange(count) / float(fps))
 
-    def check(self, name: str, wanted_s: Float[np.ndarray, " m"] | None = None) -> None:
-        """Raise `InputError` for a time without a near frame; by default, for any long pause."""
+    def check(
+        self, name: str, wanted_s: Float[np.ndarray, " m"] | None = None, *, fix: str | None = None
+    ) -> None:
+        """Raise `InputError` for a time without a near frame; by default, for any long pause.
+
+        `fix` replaces the advice to convert a video.
+        """
         times_s = self.times_s
         if wanted_s is None:
             wanted_s = (times_s[1:] + times_s[:-1]) / 2
@@ -100,7 +105,8 @@ class Timeline:
             raise InputError(
                 f"{name} has a variable frame rate: it has no frame between "
                 f"{between[0]:.2f} and {between[-1]:.2f} s, and a pause may last "
-                f"{2 * limit_s:.2g} s. Convert it, for instance with `{convert(self.fps)}`."
+                f"{2 * limit_s:.2g} s. "
+                + (fix or f"Convert it, for instance with `{convert(self.fps)}`.")
             )
 
     def report(self, name: str) -> None:
@@ -144,7 +150,7 @@ def row_times(
             "dropped", name, len(dropped), len(numbers), dropped[0],
         )  # fmt: skip
     timeline = Timeline.of((ordered / _ROW_S).tolist(), Fraction(_ROW_S), rates)
-    timeline.check(name)
+    timeline.check(name, fix="Cut it there, and use the parts.")
     timeline.report(name)
     return given[first], float(ordered[0]), timeline
 

@@ -177,7 +177,9 @@ def describe(stream: VideoStream, name: str, listing: Listing) -> VideoInfo:
     try:
         first = next(frames, None)
     except DamagedError as error:
-        raise listing.undecodable(name) if listing.cut else error from error
+        if listing.cut:
+            raise listing.undecodable(name) from error
+        raise
     if first is None:
         raise InputError(f"{name} holds no frames. Export or download it again.")
     height, width = shown_size(stream, first)
@@ -228,8 +230,10 @@ def _decode(
                 if len(kept) == len(wanted) and stop < timeline.count:
                     break
         except DamagedError as error:
+            if damage == "refuse" and listing.cut:
+                raise listing.undecodable(name) from error
             if damage == "refuse" or not len(kept):
-                raise listing.undecodable(name) if listing.cut else error from error
+                raise
     if not len(kept):
         since = f" from frame {frames.start} on" if frames.start else ""
         raise InputError(f"{name} holds no frames{since}.")

@@ -27,6 +27,7 @@ dataset's card of 2025 and the loaders of its challenges.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -35,8 +36,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import tyro
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from egosim_jax.data.pairing import pair_rows
 from egosim_jax.data.readers import Entry, find_files, make_id, require
 from egosim_jax.data.readers.hands import clean_joints
 from egosim_jax.data.readers.lenses import Lens, Remap
@@ -50,6 +52,8 @@ from egosim_jax.io.untrusted.hdf5 import read_hdf5
 from egosim_jax.io.video import VideoInfo, write_frames
 from egosim_jax.types import Cameras, InputError
 
+logger = logging.getLogger(__name__)
+
 TOOL_M = 0.23
 """Distance from the flange to the fingertips along its z axis, in meters, as EnerVerse-AC draws."""
 MAX_OPENING_MM = 120.0
@@ -58,8 +62,6 @@ MAX_SHARE, MAX_VALUE_MM = 1.5, 150.0
 """Bounds of the largest value of the grippers: below, it may be a share; above, no opening."""
 MIN_AGREEMENT = 0.3
 """Minimum correlation of the grippers' values and commands that decides their sign."""
-MAX_SURPLUS = 2
-"""Maximum difference in length of video, poses and states of an episode, in frames."""
 CHUNK = 64
 """Number of frames to remap at a time."""
 Reading = Literal["camera_to_base", "base_to_camera"]
@@ -142,9 +144,13 @@ class AgiBot:
         lens = _read_lens(files.camera / "head_intrinsic_params.json", info)
         matrices = _read_extrinsics(files.camera / "head_extrinsic_params_aligned.json")
         joints, tools, notes = _read_grippers(files.states, self.opening)
-        span = _span(part, {"frames": info.frames, "poses": len(matrices), "states": len(joints)})
-        joints, matrices = joints[span], matrices[span]
-        poses, decision = self._decide(matrices, tools[span], lens)
+        counts = {"poses": len(matrices), "states": len(joints)}
+        what = " and ".join(f"{name} {count}" for name, count in counts.items())
+        rows = pair_rows(files.video, info, min(counts.values()), what=f"rows ({what})")
+        span = _span(part, rows, files.video)
+        rows = rows[span]
+        joints, matrices = joints[rows], matrices[rows]
+        poses, decision = self._decide(matrices, tools[rows], lens)
         remap = None if lens.is_pinhole() else Remap.of(lens)
         cameras = Cameras(
             world_from_camera=poses,
@@ -169,7 +175,7 @@ class AgiBot:
             metric=True,
             joints_m=None if np.isnan(joints).all() else joints,
             kind="robot",
-            depth=_find_depth(files.depth, span) if remap is None else None,
+            depth=_find_depth(files.depth, rows) if remap is None else None,
             caption=part.caption,
             provenance={
                 **decision,
@@ -242,22 +248,21 @@ def _text(entry: Mapping[str, Any], name: str) -> str | None:
     return text if isinstance(text, str) and text.strip() else None
 
 
-def _span(part: _Part, counts: Mapping[str, int]) -> slice:
-    """Return the frames of a part. Raises `InputError` if video, poses or states lack them."""
-    written = ", ".join(f"{name} {count}" for name, count in counts.items())
-    if max(counts.values()) - min(counts.values()) > MAX_SURPLUS:
-        raise InputError(
-            f"The episode has different numbers of {written}: they may differ by at most "
-            f"{MAX_SURPLUS}. It is damaged in the set itself."
-        )
-    length = min(counts.values())
-    stop = length if part.stop is None else min(part.stop, length)
-    if not 0 <= part.start < stop or (part.stop or 0) > length + MAX_SURPLUS:
+def _span(part: _Part, rows: Int[np.ndarray, " f"], video: Path) -> slice:
+    """Return the frames of a part, given the row of each. Raises `InputError` if there is none."""
+    stop = len(rows) if part.stop is None else int(np.searchsorted(rows, part.stop))
+    start = int(np.searchsorted(rows, part.start))
+    if part.start < 0 or start >= stop:
         raise InputError(
             f"Part {part.number} is from frame {part.start} to {part.stop}: the episode has "
-            f"{written}, and a part must have at least one frame of it."
+            f"{len(rows)} frames with poses and states, and a part must have at least one of them."
         )
-    return slice(part.start, stop)
+    if part.stop is not None and part.stop > rows[-1] + 1:
+        logger.warning(
+            "%s: part %d ends at frame %d, and the episode at %d: what fits is used",
+            quote_path(video), part.number, part.stop, int(rows[-1]) + 1,
+        )  # fmt: skip
+    return slice(start, stop)
 
 
 def _read_lens(path: Path, info: VideoInfo) -> Lens:
@@ -364,10 +369,10 @@ def _meaning(command: np.ndarray | None, opening: Float[np.ndarray, "f 2"], path
     return "closed_mm" if agreement > 0 else "open_mm"
 
 
-def _find_depth(folder: Path, span: slice) -> DepthFiles | None:
+def _find_depth(folder: Path, rows: np.ndarray) -> DepthFiles | None:
     found = {path.stem.rpartition("_")[2]: path for path in folder.glob("head_depth_*.png")}
     numbered = {int(digits): path for digits, path in found.items() if digits.isdecimal()}
-    paths = tuple(numbered.get(frame) for frame in range(span.start, span.stop))
+    paths = tuple(numbered.get(frame) for frame in rows.tolist())
     return DepthFiles(paths=paths, unit_m=0.001) if any(paths) else None
 
 

@@ -28,6 +28,7 @@ import tyro
 from einops import rearrange
 from jaxtyping import Float
 
+from egosim_jax.data.pairing import pair_rows
 from egosim_jax.data.readers import Entry, find_files, make_id, require
 from egosim_jax.data.readers.hands import clean_joints
 from egosim_jax.data.recording import Recording
@@ -82,27 +83,27 @@ class EgoDex:
         )
         poses, intrinsics = (file.arrays[n] for n in ("transforms/camera", "camera/intrinsic"))
         lengths = {len(a) for name, a in file.arrays.items() if name != "camera/intrinsic"}
-        if lengths != {info.frames}:
+        if lengths != {len(poses)}:
             raise InputError(
                 f"{quote_path(path)} has {len(poses)} camera poses, joints or confidences of "
-                f"{quote(str(sorted(lengths)))} frames, and {video.name} has {info.frames}: all "
-                "must agree. Get both files again."
+                f"{quote(str(sorted(lengths)))} frames: all must agree. Get the file again."
             )
+        rows = pair_rows(video, info, len(poses), what="camera poses")
         joints = self._joints(file.arrays, names, path)
         caption, objects = _texts(file.texts)
         cameras = Cameras(
-            world_from_camera=poses,
+            world_from_camera=poses[rows],
             intrinsics_px=_fit_intrinsics(intrinsics, info.height, info.width),
             height=info.height,
             width=info.width,
         )
         counts: dict[str, str] = {}
         if joints is not None:
-            joints, counts = clean_joints(joints, cameras)
+            joints, counts = clean_joints(joints[rows], cameras)
         return Recording(
             recording_id=make_id([path.stem]),
             video=video,
-            frames=info.frames,
+            frames=len(rows),
             fps=info.fps,
             height=info.height,
             width=info.width,

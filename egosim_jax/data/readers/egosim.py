@@ -13,8 +13,9 @@ Followed: jinkun-hao/EgoSim of 2026, `data_process`.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -22,6 +23,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 import tyro
 
+from egosim_jax.data.pairing import pair_rows
 from egosim_jax.data.readers import Entry, make_id, natural_order
 from egosim_jax.data.readers.egovid import read_matrices
 from egosim_jax.data.readers.hamer import read_hamer
@@ -32,6 +34,8 @@ from egosim_jax.geometry import invert
 from egosim_jax.io.bounded import quote_path, read_bytes
 from egosim_jax.io.segments import probe_long_video
 from egosim_jax.types import Cameras, InputError
+
+logger = logging.getLogger(__name__)
 
 VIDEOS = ("video_16fps.mp4", "video.mp4")
 """Names of the video; poses belong to the first."""
@@ -71,12 +75,9 @@ def _read(clip: Path, folder: Path) -> Recording:
     info = probe_long_video(video)
     info.check_square(quote_path(video))
     poses_folder = _find_poses(clip / "_proc")
-    paths = sorted(poses_folder.glob("extrinsics_*.npy"), key=natural_order)
-    if len(paths) != info.frames:
-        raise InputError(
-            f"{quote_path(poses_folder)} has {len(paths)} extrinsics, and {video.name} "
-            f"{info.frames} frames: each frame must have one. Run DA3 on this video."
-        )
+    paths, found = _numbered(poses_folder)
+    rows = pair_rows(video, info, found, what="extrinsics")
+    rows = rows[rows < len(paths)]
     poses = invert(np.stack([read_matrices(path, (4, 4)) for path in paths]))
     cameras = [
         read_matrices(path.with_name(path.name.replace("extrinsics", "intrinsics")), (3, 3))
@@ -91,12 +92,14 @@ def _read(clip: Path, folder: Path) -> Recording:
         )
     seen = Cameras(world_from_camera=poses, intrinsics_px=intrinsics, height=info.height,
                    width=info.width)  # fmt: skip
+    paired = replace(seen, world_from_camera=poses[rows])
     joints, counts = None, dict[str, str]()
     hands = sorted((clip / "_proc" / "mano_full").rglob("*.json"))
     if hands:
-        joints, counts = clean_joints(read_hamer(hands[0], seen), seen)
+        limit = max(len(paths), len(info.timeline.listed_s))
+        joints, counts = clean_joints(read_hamer(hands[0], seen, limit)[rows], paired)
     depth = poses_folder / "depth_000000.npy"
-    files = (depth if depth.exists() else None, *[None] * (info.frames - 1))
+    files = (depth if depth.exists() else None, *[None] * (len(rows) - 1))
     caption = clip / "caption.txt"
     text = ""
     if caption.exists():
@@ -104,11 +107,11 @@ def _read(clip: Path, folder: Path) -> Recording:
     return Recording(
         recording_id=make_id([clip.resolve().name]),
         video=video,
-        frames=info.frames,
+        frames=len(rows),
         fps=info.fps,
         height=info.height,
         width=info.width,
-        world_from_camera=poses,
+        world_from_camera=paired.world_from_camera,
         intrinsics_px=intrinsics,
         metric=True,
         joints_m=joints,
@@ -121,6 +124,24 @@ def _read(clip: Path, folder: Path) -> Recording:
             **counts,
         },
     )
+
+
+def _numbered(folder: Path) -> tuple[list[Path], int]:
+    """Return the extrinsics of the frames from 0 to the first gap, and the number of all."""
+    digits = {path.stem.rpartition("_")[2]: path for path in folder.glob("extrinsics_*.npy")}
+    found = {int(text): path for text, path in digits.items() if text.isdecimal()}
+    first = next(number for number in range(len(found) + 1) if number not in found)
+    if not first:
+        raise InputError(
+            f"{quote_path(folder)} has no extrinsics_000000.npy: frames are numbered from 0. Run "
+            "DA3 on the whole video."
+        )
+    if first < len(found):
+        logger.warning(
+            "%s has %d extrinsics, but none of frame %d: only the frames before it are used",
+            quote_path(folder), len(found), first,
+        )  # fmt: skip
+    return [found[number] for number in range(first)], len(found)
 
 
 def _find_poses(folder: Path) -> Path:

@@ -8,15 +8,16 @@
 The dataset documents neither the direction of the poses (camera to world or the reverse) nor the
 pixel centers. The direction is decided from the video by epipolar geometry (`pose_reading`) and
 recorded; poses stay unknown if the video does not decide. Pixel centers are assumed at integers.
-Poses are used only if every frame of the clip has one. The fused poses are structure from motion
-scaled by an accelerometer. That scale is not trusted, so `metric` is False. The dataset has no
-hands. Followed: its README of 2025.
+Of a clip with more frames than poses, the frames with poses are used. The fused poses are structure
+from motion scaled by an accelerometer. That scale is not trusted, so `metric` is False. The dataset
+has no hands. Followed: its README of 2025.
 """
 
 from __future__ import annotations
 
 import csv
 import io
+import logging
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
+from egosim_jax.data.pairing import check_lengths, pair_rows
 from egosim_jax.data.readers import Entry, find_files, make_id
 from egosim_jax.data.readers.pose_reading import read_poses
 from egosim_jax.data.recording import Recording
@@ -36,6 +38,8 @@ from egosim_jax.io.segments import probe_long_video, read_segment
 from egosim_jax.io.untrusted.npz import read_npy
 from egosim_jax.io.video import VideoInfo
 from egosim_jax.types import InputError
+
+logger = logging.getLogger(__name__)
 
 POSES = ("fused_pose.npy", "sfm_pose.npy")
 """Files of poses, the recommended one first."""
@@ -85,14 +89,20 @@ def _read(
     uuid, start, stop = _split(video_id)
     info = probe_long_video(video)
     if video.stem == uuid and video.stem != video_id:
-        frames = stop - start
+        frames = max(0, min(stop, info.frames) - start)
+        if frames < stop - start:
+            why = f"frames {start} to {stop - 1}, and {quote_path(video)} has {info.frames}"
+            if not frames:
+                raise InputError(f"{video_id} is {why}. Download the complete video.")
+            logger.warning("%s is %s: the first %d are used", video_id, why, frames)
     else:
         start, frames = 0, info.frames
     notes: dict[str, str] = {}
     poses = intrinsics = None
     path = root / "poses" / video_id
     if path.is_dir() and re.fullmatch(_ID, video_id):
-        poses, intrinsics, notes = _read_cameras(path, video, info, start, frames)
+        rows, poses, intrinsics, notes = _read_cameras(path, video, info, start, frames)
+        frames = frames if rows is None else len(rows)
     caption = row.get("llava_cap", "").strip() or row.get("name", "").strip()
     nouns = [noun.strip() for noun in row.get("noun_cls", "").split(",")]
     return Recording(
@@ -113,20 +123,30 @@ def _read(
 
 def _read_cameras(
     folder: Path, video: Path, info: VideoInfo, start: int, frames: int
-) -> tuple[Float[np.ndarray, "f 4 4"] | None, Float[np.ndarray, "3 3"], dict[str, str]]:
+) -> tuple[np.ndarray | None, np.ndarray | None, Float[np.ndarray, "3 3"], dict[str, str]]:
+    """Return the row of each frame and its pose, both None if unknown, intrinsics and notes."""
     path = next((folder / name for name in POSES if (folder / name).exists()), None)
     if path is None:
         raise InputError(f"{quote_path(folder)} has none of {', '.join(POSES)}.")
     intrinsics = read_matrices(folder / "intri.npy", (3, 3))
     intrinsics[:2] *= info.height / ROWS
     matrices = read_matrices(path, (None, 4, 4))
-    if len(matrices) != frames:
+    try:
+        if start == 0 and frames == info.frames:
+            rows = pair_rows(video, info, len(matrices), what="poses")
+        else:
+            fps = float(info.fps)
+            rows = np.arange(check_lengths(video, frames, len(matrices), fps=fps, what="poses"))
+    except InputError as error:
+        logger.warning("%s Its poses stay unknown.", error)
         why = f"unknown: {len(matrices)} poses for {frames} frames"
-        return None, intrinsics, {"poses": why}
-    decoded = read_segment(video, start=start, count=frames, each=_halve).frames
+        return None, None, intrinsics, {"poses": why}
+    decoded = read_segment(video, start=start, count=len(rows), each=_halve).frames
     scale = np.diag([0.5, 0.5, 1.0])
-    poses, evidence = read_poses(decoded, matrices, scale @ intrinsics)
-    return poses, intrinsics, {**evidence, "poses_file": path.name}
+    poses, evidence = read_poses(decoded, matrices[rows], scale @ intrinsics)
+    if poses is None:
+        rows = None
+    return rows, poses, intrinsics, {**evidence, "poses_file": path.name}
 
 
 def _halve(frame: np.ndarray) -> np.ndarray:

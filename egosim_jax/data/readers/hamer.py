@@ -28,27 +28,28 @@ MAX_BYTES = 1 << 28
 """Maximum size of a file in bytes."""
 
 
-def read_hamer(path: Path, cameras: Cameras) -> Float[np.ndarray, "f 2 21 3"]:
+def read_hamer(path: Path, cameras: Cameras, frames: int) -> Float[np.ndarray, "f 2 21 3"]:
     """Return joints in the world, left before right, NaN where there is no hand.
 
-    Raises `InputError` if the file is not HaMeR's, or names frames that the cameras do not have.
+    Hands of frames without a camera are omitted. Raises `InputError` if the file is not HaMeR's,
+    or names frames that the video, of the length `frames`, does not have.
     """
     written = read_json(path, limit=MAX_BYTES)
-    frames = written.get("frames") if isinstance(written, dict) else None
-    if not isinstance(frames, list):
+    entries = written.get("frames") if isinstance(written, dict) else None
+    if not isinstance(entries, list):
         raise InputError(f"{quote_path(path)} has no frames: it is not a result of HaMeR.")
     count = len(cameras.world_from_camera)
     joints = np.full((count, 2, 21, 3), np.nan)
     best = np.full((count, 2), -np.inf)
-    for entry in frames:
+    for entry in entries:
         number = entry.get("frame_idx") if isinstance(entry, dict) else None
         hands = entry.get("hands") if isinstance(entry, dict) else None
-        if type(number) is not int or not 0 <= number < count or not isinstance(hands, list):
+        if type(number) is not int or not 0 <= number < frames or not isinstance(hands, list):
             raise InputError(
                 f"{quote_path(path)}: frame {quote(number)} with hands {quote(hands)}: frame_idx "
-                f"must be from 0 to {count - 1}. Run HaMeR on the same video."
+                f"must be from 0 to {frames - 1}. Run HaMeR on the same video."
             )
-        for hand in hands:
+        for hand in hands if number < count else ():
             side, confidence, points, position = _hand(hand, path)
             if confidence > best[number, side]:
                 best[number, side] = confidence

@@ -43,6 +43,7 @@ from egosim_jax.io.bounded import (
     refusing,
 )
 from egosim_jax.io.images import decode_image
+from egosim_jax.io.timing import row_times
 from egosim_jax.io.video import write_frames
 from egosim_jax.types import Cameras, InputError
 
@@ -89,13 +90,14 @@ class Hot3D:
                     f"{quote_path(path)} has no <n>.cameras.json: it is not a HOT3D clip."
                 )
             cameras = [clip.camera(key, self.stream) for key in keys]
+            picked, fps = clip.moments(keys, self.stream)
+            keys, cameras = ([values[n] for n in picked] for values in (keys, cameras))
             lens = _lens([calibration for calibration, _ in cameras], clip.name)
             remap = Remap.of(lens)
             poses = np.concatenate([pose for _, pose in cameras])
             turned = self.stream == COLOR
             images = remap.apply(clip.image(f"{key}.image_{self.stream}.jpg") for key in keys)
             frames = (np.rot90(image, -1) for image in images) if turned else images
-            fps = clip.rate(keys, self.stream)
             _, height, width = write_frames(folder / "video.mp4", frames, fps)
             joints = clip.hands(keys)
         intrinsics = remap.intrinsics_px.copy()
@@ -190,18 +192,20 @@ class _Clip:
                     joints[frame, side] = model.keypoints(angles, wrist, side)
         return joints
 
-    def rate(self, keys: list[str], stream: str) -> Fraction:
-        """Return the frame rate, computed from timestamps."""
-        times = []
+    def moments(self, keys: list[str], stream: str) -> tuple[list[int], Fraction]:
+        """Return the frames nearest to the moments of a constant rate, and the rate."""
+        stamps = []
         for key in keys:
-            stamps = self.json(f"{key}.info.json").get("image_timestamps_ns")
-            times.append(stamps.get(stream) if isinstance(stamps, dict) else None)
-        if len(times) < 2 or not all(type(time) is int for time in times):
+            written = self.json(f"{key}.info.json").get("image_timestamps_ns")
+            time = written.get(stream) if isinstance(written, dict) else None
+            stamps.append(time / 1e9 if type(time) is int else None)
+        if len([stamp for stamp in stamps if stamp is not None]) < 2:
             raise InputError(f"{self.name} has no timestamps of stream {quote(stream)}.")
-        period = float(np.median(np.diff(np.array(times, float)))) / 1e9
-        if not 1e-3 <= period <= 10:
-            raise InputError(f"{self.name}: {period:g} s between frames is no frame rate.")
-        return Fraction(1 / period).limit_denominator(1001)
+        rows, _, timeline = row_times(stamps, [], f"{self.name}, image_timestamps_ns")
+        if not Fraction(1, 10) <= timeline.fps <= 1000:
+            raise InputError(f"{self.name}: {float(timeline.fps):g} is no frame rate.")
+        moments_s = timeline.moments_s(0, timeline.count)
+        return rows[timeline.nearest(moments_s)].tolist(), timeline.fps
 
     def _pose(self, written: Any, key: str) -> np.ndarray:
         parts = written if isinstance(written, dict) else {}

@@ -171,7 +171,7 @@ def test_depth_files_are_found_by_frame(world, tmp_path, imported):
     assert recording.read_depth(3)[0, 0] == pytest.approx(0.8)
 
 
-def test_damaged_episodes_are_named(world, tmp_path, imported):
+def test_damaged_episodes_are_named(world, tmp_path, imported, caplog):
     for number in range(4):
         write_episode(tmp_path / "set", world, episode=str(number), parts=False)
     base = tmp_path / "set/parameters/327"
@@ -183,7 +183,8 @@ def test_damaged_episodes_are_named(world, tmp_path, imported):
         '{"intrinsic": {"fx": 1e9}}'
     )
     done, problems = imported(AgiBot(source=tmp_path / "set"))
-    assert list(done) == ["327_3_000"]
-    assert "poses 5" in problems["327_0_000"]
+    assert list(done) == ["327_0_000", "327_3_000"]
+    assert done["327_0_000"].frames == 5
+    assert "12 frames and 5 rows (poses 5 and states 12)" in caplog.text
     assert "rotation_matrix" in problems["327_1_000"]
     assert "fx" in problems["327_2_000"]

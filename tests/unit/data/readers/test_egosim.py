@@ -48,10 +48,25 @@ def test_smoothed_poses_are_preferred(world, tmp_path, imported):
     assert "smoothed" in recording.provenance["poses"]
 
 
-def test_poses_of_another_video_are_refused(world, tmp_path, imported):
+@pytest.mark.parametrize(("absent", "frames"), [(11, 11), (4, 4)])
+def test_frames_are_read_until_the_first_one_without_a_pose(
+    world, tmp_path, imported, caplog, absent, frames
+):
     target = write_clip(tmp_path / "fold_1", world)
-    (target / "extrinsics_000011.npy").unlink()
-    assert "11 extrinsics" in imported(EgoSimClips(source=tmp_path / "fold_1"))[1]["fold_1"]
+    (target / f"extrinsics_{absent:06d}.npy").unlink()
+    recording = imported(EgoSimClips(source=tmp_path / "fold_1"))[0]["fold_1"]
+    assert recording.frames == frames
+    np.testing.assert_allclose(recording.world_from_camera, world.poses[:frames], atol=1e-6)
+    assert "12 frames and 11 extrinsics" in caplog.text
+
+
+def test_poses_of_another_rate_are_refused(world, tmp_path, imported):
+    target = write_clip(tmp_path / "fold_1", world)
+    for number in range(6, 12):
+        (target / f"extrinsics_{number:06d}.npy").unlink()
+    problem = imported(EgoSimClips(source=tmp_path / "fold_1"))[1]["fold_1"]
+    assert "6 extrinsics, as at 8 frames per second" in problem
+    assert "ffmpeg -i IN -vf fps=8 OUT" in problem
 
 
 def write_hands(folder, world, **changes):

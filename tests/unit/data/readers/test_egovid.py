@@ -63,11 +63,17 @@ def test_poses_that_do_not_fit_the_video_stay_unknown(plane, tmp_path, imported)
     assert recording.intrinsics_px is not None
 
 
-def test_poses_of_another_number_of_frames_stay_unknown(plane, tmp_path, imported):
+def test_of_more_frames_than_poses_those_with_poses_are_used(plane, tmp_path, imported):
     video_id = write_set(tmp_path / "set", plane, poses=plane.poses[:15])
     recording = imported(EgoVid(source=tmp_path / "set"))[0][video_id]
+    np.testing.assert_allclose(recording.world_from_camera, plane.poses[:15], atol=1e-9)
+
+
+def test_poses_of_another_rate_stay_unknown(plane, tmp_path, imported):
+    video_id = write_set(tmp_path / "set", plane, poses=plane.poses[:10])
+    recording = imported(EgoVid(source=tmp_path / "set"))[0][video_id]
     assert recording.world_from_camera is None
-    assert recording.provenance["poses"] == "unknown: 15 poses for 20 frames"
+    assert recording.provenance["poses"] == "unknown: 10 poses for 20 frames"
 
 
 def test_a_span_of_a_long_video_is_taken(world, tmp_path, imported):
