@@ -23,6 +23,7 @@ from egosim_jax.io.decoding import (
     FrameBuffer,
     check_packet,
     check_size,
+    container_of,
     decode_packet,
     frame_rate,
     open_file,
@@ -113,7 +114,7 @@ def _list(file: File, name: str) -> _Listing:
     times, keys = list[int](), list[tuple[int, int]]()
     with open_video(file, name, None) as stream:
         try:
-            for packet in stream.container.demux(stream):
+            for packet in container_of(stream).demux(stream):
                 if not packet.size:
                     continue
                 if packet.is_corrupt or packet.pts is None or len(times) > MAX_SAMPLES:
@@ -139,7 +140,7 @@ def _unevenness(times: list[int]) -> float:
 
 def _frames(stream: VideoStream, name: str, dts: int) -> Iterator[VideoFrame]:
     """Yield decoded frames, starting at the key frame with decoding time `dts`."""
-    container = stream.container
+    container = container_of(stream)
     container.seek(dts, stream=stream, backward=True)
     size, count = None, 0
     for packet in container.demux(stream):
