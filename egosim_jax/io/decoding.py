@@ -28,10 +28,11 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 import av
 import numpy as np
+from av.container import InputContainer
 from av.error import ArgumentError
 from av.packet import Packet
 from av.stream import Disposition
@@ -149,6 +150,11 @@ def open_video(file: File, name: str, max_frames: int | None) -> Iterator[VideoS
         yield stream
 
 
+def container_of(stream: VideoStream) -> InputContainer:
+    """Return the container that a stream is read from."""
+    return cast(InputContainer, stream.container)
+
+
 def read_packets(stream: VideoStream, name: str, max_frames: int) -> Iterator[Packet | None]:
     """Yield packets, then None, which flushes the decoder.
 
@@ -157,7 +163,7 @@ def read_packets(stream: VideoStream, name: str, max_frames: int) -> Iterator[Pa
     read = 0
     try:
         with refusing(f"{name} is damaged", DamagedError):
-            for number, packet in enumerate(stream.container.demux(stream)):
+            for number, packet in enumerate(container_of(stream).demux(stream)):
                 check_size(name, number // 2, 0, max_frames)  # empty packets count, too
                 if packet.is_corrupt:
                     raise DamagedError(f"{name} is cut off after {read} frames.")

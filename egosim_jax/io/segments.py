@@ -23,6 +23,7 @@ from egosim_jax.io.decoding import (
     File,
     FrameBuffer,
     check_size,
+    container_of,
     decode_packet,
     open_file,
     open_video,
@@ -158,7 +159,7 @@ def _list(file: File, name: str) -> Listing:
 
 def _frames(stream: VideoStream, name: str, dts: int) -> Iterator[VideoFrame]:
     """Yield decoded frames, starting at the key frame with decoding time `dts`."""
-    container = stream.container
+    container = container_of(stream)
     container.seek(dts, stream=stream, backward=True)
     size, count = None, 0
     packets = (packet if packet.size else None for packet in container.demux(stream))

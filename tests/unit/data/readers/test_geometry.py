@@ -96,6 +96,6 @@ def test_a_reader_takes_videos_as_their_files_say(tmp_path, imported, name, kind
         recording = next(iter(done.values()))
         assert (recording.height, recording.width) == (world.height, world.width)
         frames = recording.read_frames(0, 3).frames
-        assert np.abs(frames.astype(float) - world.video[:3]).mean() < 6
+        assert np.abs(frames.astype(float) - world.video[:3]).mean() < 12  # noise of one pixel
         if recording.intrinsics_px is not None:
             np.testing.assert_allclose(recording.intrinsics_px, world.intrinsics, atol=1e-4)
