@@ -5,6 +5,7 @@ are shaded meshes on black. 50 DDIM steps with guidance away from the empty prom
 `paper` reproduces the paper's tables. (Kim et al. 2026, Dexterous World Models.)
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 from egosim_jax.conditioning.layout import DWM
@@ -48,13 +49,17 @@ SAMPLINGS = {
         "solver": CONFIG.solver,
         "unconditional_prompt": CONFIG.unconditional_prompt,
         "encoding_noise": CONFIG.encoding_noise,
+        "dit": replace(CONFIG.dit, time_angles="float32"),
     },
     "paper": {
         "solver": DPMSolver(stochastic=True),
         "unconditional_prompt": NEGATIVE_PROMPT,
         "encoding_noise": EncodingNoise(hands=True, prior_pixels=0.0563),
+        "dit": replace(CONFIG.dit, time_angles="float32"),
+        "vae": replace(CONFIG.vae, decode_first=1),
     },
 }
 """Named samplings: the release's, and the one of the scripts behind the paper's tables.
 
-The paper uses CogVideoX-Fun's own pipeline, which adds noise to the pixels of the prior."""
+The paper uses CogVideoX-Fun's own pipeline, which adds noise to the pixels of the prior and decodes
+1, 2, 2, ... latent frames at a time. Both embed the time by float32 angles, as diffusers does."""
