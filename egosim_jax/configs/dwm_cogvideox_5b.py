@@ -24,7 +24,9 @@ from egosim_jax.types import VideoSpec
 CONFIG = ModelConfig(
     name="dwm_cogvideox_5b",
     video=VideoSpec(frames=49, height=480, width=720, fps=8),
-    dit=CogVideoXDiTConfig(in_channels=49, dtype="bfloat16", remat="attention"),
+    dit=CogVideoXDiTConfig(
+        in_channels=49, dtype="bfloat16", remat="attention", time_angles="float32"
+    ),
     vae=CogVideoXVAEConfig(dtype="bfloat16"),
     text=T5Config(dtype="bfloat16"),
     image=None,
@@ -49,17 +51,15 @@ SAMPLINGS = {
         "solver": CONFIG.solver,
         "unconditional_prompt": CONFIG.unconditional_prompt,
         "encoding_noise": CONFIG.encoding_noise,
-        "dit": replace(CONFIG.dit, time_angles="float32"),
     },
     "paper": {
         "solver": DPMSolver(stochastic=True),
         "unconditional_prompt": NEGATIVE_PROMPT,
         "encoding_noise": EncodingNoise(hands=True, prior_pixels=0.0563),
-        "dit": replace(CONFIG.dit, time_angles="float32"),
         "vae": replace(CONFIG.vae, decode_first=1),
     },
 }
 """Named samplings: the release's, and the one of the scripts behind the paper's tables.
 
 The paper uses CogVideoX-Fun's own pipeline, which adds noise to the pixels of the prior and decodes
-1, 2, 2, ... latent frames at a time. Both embed the time by float32 angles, as diffusers does."""
+1, 2, 2, ... latent frames at a time."""

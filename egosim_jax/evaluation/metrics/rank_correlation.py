@@ -24,8 +24,8 @@ DEFINITIONS = {
     "generated world and in the true one; of the shares, and of their ranks",
     "mmrv": "mean over policies of the largest difference in true success to a policy that the "
     "generated world ranks wrongly against it",
-    "low, high": "95 % intervals over scenes, which all policies share: of Pearson's correlation by "
-    "the jackknife, without the spread by chance of few scenes; of the MMRV by the bootstrap",
+    "low, high": "95 % intervals over scenes, which all policies share: of Pearson's correlation "
+    "by the jackknife, without the spread by chance of few scenes; of the MMRV by the bootstrap",
 }
 
 
