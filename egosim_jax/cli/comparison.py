@@ -36,7 +36,8 @@ class Options:
     """Folders of {id}.mp4, each as DIR or NAME=DIR.
 
     A clip may also be in a subfolder named after its dataset or split. If a folder has a
-    results.jsonl, it lists the clips and windows. Paired differences are from the first folder."""
+    results.jsonl, it lists the clips and windows. Paired differences are from the first folder.
+    Several folders of one NAME are seeds of one method, and their scores are averaged by clip."""
     where: str | None = None
     """Select rows by the value of a column, for instance split=test."""
     baselines: tuple[Baseline, ...] = ("prior", "prior_fit", "still")

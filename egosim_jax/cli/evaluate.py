@@ -36,7 +36,7 @@ class Evaluate(Options):
         from egosim_jax.evaluation.result import SHOWN
         from egosim_jax.evaluation.scoring import Protocol
 
-        folders = [Folder.parse(text) for text in self.generated]
+        folders = Folder.parse_all(self.generated)
         first = folders[0]
         if len(folders) == 1 and "=" not in self.generated[0]:
             folders = [replace(first, name="generated", title="generated")]

@@ -47,7 +47,7 @@ class TableCommand(Options):
         from egosim_jax.evaluation.tables import TABLES
 
         table = TABLES[self.name]
-        folders = [Folder.parse(text) for text in self.generated]
+        folders = Folder.parse_all(self.generated)
         clips = [c for c in self.read_clips() if c.extra.get(table.group) in table.groups]
         if not clips:
             raise InputError(

@@ -5,6 +5,7 @@ are shaded meshes on black. 50 DDIM steps with guidance away from the empty prom
 `paper` reproduces the paper's tables. (Kim et al. 2026, Dexterous World Models.)
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 from egosim_jax.conditioning.layout import DWM
@@ -23,7 +24,9 @@ from egosim_jax.types import VideoSpec
 CONFIG = ModelConfig(
     name="dwm_cogvideox_5b",
     video=VideoSpec(frames=49, height=480, width=720, fps=8),
-    dit=CogVideoXDiTConfig(in_channels=49, dtype="bfloat16", remat="attention"),
+    dit=CogVideoXDiTConfig(
+        in_channels=49, dtype="bfloat16", remat="attention", time_angles="float32"
+    ),
     vae=CogVideoXVAEConfig(dtype="bfloat16"),
     text=T5Config(dtype="bfloat16"),
     image=None,
@@ -53,8 +56,10 @@ SAMPLINGS = {
         "solver": DPMSolver(stochastic=True),
         "unconditional_prompt": NEGATIVE_PROMPT,
         "encoding_noise": EncodingNoise(hands=True, prior_pixels=0.0563),
+        "vae": replace(CONFIG.vae, decode_first=1),
     },
 }
 """Named samplings: the release's, and the one of the scripts behind the paper's tables.
 
-The paper uses CogVideoX-Fun's own pipeline, which adds noise to the pixels of the prior."""
+The paper uses CogVideoX-Fun's own pipeline, which adds noise to the pixels of the prior and decodes
+1, 2, 2, ... latent frames at a time."""

@@ -20,7 +20,7 @@ from egosim_jax.evaluation.methods import Shape, read_at
 from egosim_jax.evaluation.metrics.depth import depth_error
 from egosim_jax.evaluation.metrics.hands import hand_iou, hand_recall, keypoint_errors
 from egosim_jax.evaluation.metrics.region import region_psnr
-from egosim_jax.evaluation.metrics.trajectory import path_errors
+from egosim_jax.evaluation.metrics.trajectory import MIN_EXTENT, path_errors
 from egosim_jax.io.digest import sha256
 from egosim_jax.perception.estimates import (
     CameraEstimate,
@@ -56,7 +56,7 @@ def hand_region(truth: GroundTruth) -> Bool[np.ndarray, "f h w"]:
 
 
 def _shape(truth: GroundTruth) -> Shape:
-    return Shape(*truth.frames.shape[:3])
+    return Shape(*truth.frames.shape[:3], truth.crop)
 
 
 def _object_mask(window: Window) -> Path:
@@ -180,7 +180,8 @@ class CameraError:
             "camera_rotation": "ours; RMS angle between rotations since the first frame, both "
             "paths estimated from the videos without the pixels near hands",
             "camera_error": "ours; RMS distance between positions since the first frame, each path "
-            "divided by its largest distance from there; not measured where the true camera stays",
+            "divided by its largest distance from there; not measured where the true camera stays "
+            f"within {MIN_EXTENT:g} of it",
             "camera_ate": "ours; RMS distance between positions since the first frame after the "
             "least-squares scale, divided by the extent of the ground truth's path",
         }
@@ -203,8 +204,8 @@ class CameraError:
             extent = float(np.linalg.norm(target[:, :3, 3] - target[0, :3, 3], axis=1).max())
             return {
                 "camera_rotation": errors.rotation_deg,
-                "camera_error": errors.translation if extent else NAN,
-                "camera_ate": errors.ate / extent if extent else NAN,
+                "camera_error": errors.translation if extent > MIN_EXTENT else NAN,
+                "camera_ate": errors.ate / extent if extent > MIN_EXTENT else NAN,
             }
 
         return score

@@ -14,6 +14,7 @@ from egosim_jax.evaluation.metrics import lpips
 from egosim_jax.evaluation.metrics.dreamsim import DEFINITION, DreamSim
 from egosim_jax.evaluation.metrics.image import clip_psnr, color_drift, psnr, ssim
 from egosim_jax.evaluation.metrics.report import DEFINITIONS
+from egosim_jax.evaluation.registration import WHOLE, Crop
 
 VERSION = 1
 """Version of all measures; a change invalidates cached scores."""
@@ -37,6 +38,8 @@ class GroundTruth:
     """First frame that is compared."""
     window: Window
     """Clip and window."""
+    crop: Crop = WHOLE
+    """Part of the recorded image that the frames show."""
 
     @property
     def counted(self) -> UInt8[np.ndarray, "g h w 3"]:

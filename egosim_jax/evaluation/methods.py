@@ -6,19 +6,22 @@ clip's own files.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
+from PIL import Image
 
 from egosim_jax.data.clip_files import is_safe_id
 from egosim_jax.data.transforms import resize_image
 from egosim_jax.data.windows import Window
 from egosim_jax.evaluation.metrics.image import fit_colors
+from egosim_jax.evaluation.registration import WHOLE, Crop
 from egosim_jax.io.bounded import quote_path, quote_text
 from egosim_jax.io.video import read_video
 from egosim_jax.types import InputError
@@ -26,17 +29,26 @@ from egosim_jax.types import InputError
 MAX_BORDER_PX = 8
 """Maximum number of extra rows or columns of a video that is cropped instead of resized."""
 FIT = (
-    "Pillow LANCZOS, the image stretched to the size of the comparison; a video that exceeds it "
-    f"by at most {MAX_BORDER_PX} rows and columns has a border, and is cropped to its center"
+    "Pillow LANCZOS, the image, or the part of it inside the compared crop, stretched to the size "
+    "of the comparison; a video that exceeds the size of the whole by at most "
+    f"{MAX_BORDER_PX} rows and columns has a border, and is cropped to its center"
 )
 
 
 class Shape(NamedTuple):
-    """Number of frames and size at which videos are compared."""
+    """Number of frames, size and crop at which videos are compared."""
 
     frames: int
     height: int
     width: int
+    crop: Crop = WHOLE
+    """Part of the recorded image that is compared."""
+
+    @property
+    def whole(self) -> tuple[int, int]:
+        """Height and width of the whole image at the scale of the comparison."""
+        left, top, right, bottom = self.crop
+        return round(self.height / (bottom - top)), round(self.width / (right - left))
 
 
 @runtime_checkable
@@ -78,6 +90,36 @@ class Folder:
     """Suffix of the file names before .mp4."""
     optional: bool = False
     """True if clips may be missing."""
+    seed_of: str | None = None
+    """Method whose clips of one seed the folder has; scores are averaged over its seeds."""
+    crops: dict[str, Crop] = field(default_factory=dict)
+    """Part of the recorded image that the clips show, by their ids; the whole by default."""
+
+    @property
+    def row(self) -> str:
+        """Key of the row that has the scores."""
+        return self.seed_of or self.name
+
+    @classmethod
+    def parse_all(cls, texts: Sequence[str]) -> list[Folder]:
+        """Parse folders; several that are given as one NAME=DIR have seeds of one method.
+
+        Raises `InputError`.
+        """
+        folders = [cls.parse(text) for text in texts]
+        given = Counter(f.name for f, text in zip(folders, texts, strict=True) if "=" in text)
+        paths = {name: {f.path.resolve() for f in folders if f.name == name} for name in given}
+        seen: Counter[str] = Counter()
+        for place, folder in enumerate(folders):
+            name = folder.name
+            count = given[name]
+            if count > 1 and count == len(paths[name]) == sum(f.row == name for f in folders):
+                seen[name] += 1
+                folders[place] = replace(
+                    folder, name=f"{name}_{seen[name]}", title=f"{name}, mean of {count} seeds",
+                    seed_of=name,
+                )  # fmt: skip
+        return folders
 
     @classmethod
     def parse(cls, text: str) -> Folder:
@@ -107,7 +149,8 @@ class Folder:
 
     def video(self, window: Window, shape: Shape, target: np.ndarray) -> np.ndarray:
         """Return the clip, fitted to the shape."""
-        return read_at(self.file(window), shape, 0, border=True)
+        shown = self.crops.get(window.output_id, WHOLE)
+        return read_at(self.file(window), shape, 0, border=True, shown=shown)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,27 +219,41 @@ def check_names(methods: Sequence[Method]) -> None:
     if repeated:
         raise InputError(
             f"Several methods are named {', '.join(repeated)}: each row of a table needs a name. "
-            "Give NAME=DIR. (--generated)"
+            "Give NAME=DIR; several folders of one NAME are seeds of one method. (--generated)"
         )
 
 
 def read_at(
-    path: Path, shape: Shape, start: int, *, border: bool = False
+    path: Path, shape: Shape, start: int, *, border: bool = False, shown: Crop = WHOLE
 ) -> UInt8[np.ndarray, "f h w 3"]:
     """Read frames from `start`, fitted to a shape. Raises `InputError` if there are too few.
 
-    With `border`, a narrow border around the image is cropped instead of resized.
+    The images show the part `shown` of the recorded image. With `border`, a narrow border around
+    them is cropped instead of resized.
     """
-    fit = partial(_fit, height=shape.height, width=shape.width, border=border)
+    fit = partial(_fit, shape=shape, border=border, shown=shown)
     frames = read_video(path, start=start, stop=start + shape.frames, each=fit).frames
     if len(frames) < shape.frames:
         raise InputError(f"{path} ends before frame {start + shape.frames}, which was generated.")
     return frames
 
 
-def _fit(frame: np.ndarray, *, height: int, width: int, border: bool) -> np.ndarray:
+def _fit(frame: np.ndarray, *, shape: Shape, border: bool, shown: Crop) -> np.ndarray:
+    if border:
+        frame = without_border(frame, *shape.whole)
+    if shape.crop == shown:
+        return resize_image(frame, shape.height, shape.width)
+    height, width = frame.shape[:2]
+    edges = shape.crop.within(shown).pixels(height, width)
+    box = np.clip(edges, 0, (width, height) * 2).tolist()
+    size, how = (shape.width, shape.height), Image.Resampling.LANCZOS
+    return np.asarray(Image.fromarray(frame).resize(size, how, box=box))
+
+
+def without_border(frame: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Return the center of an image that exceeds a size by a narrow border; else the image."""
     rows, columns = frame.shape[0] - height, frame.shape[1] - width
-    if border and 0 <= rows <= MAX_BORDER_PX and 0 <= columns <= MAX_BORDER_PX:
-        top, left = rows // 2, columns // 2
-        return frame[top : top + height, left : left + width]
-    return resize_image(frame, height, width)
+    if not (0 <= rows <= MAX_BORDER_PX and 0 <= columns <= MAX_BORDER_PX):
+        return frame
+    top, left = rows // 2, columns // 2
+    return frame[top : top + height, left : left + width]

@@ -24,6 +24,7 @@ from egosim_jax.evaluation.files import ARROWS
 from egosim_jax.evaluation.methods import Method, Shape, read_at
 from egosim_jax.evaluation.metrics.report import cell_of
 from egosim_jax.evaluation.result import Evaluation
+from egosim_jax.evaluation.scoring import row_of
 from egosim_jax.io.run import write_text
 from egosim_jax.io.video import encode_video, probe_video
 from egosim_jax.runtime.progress import track
@@ -112,9 +113,9 @@ def _clips(evaluation: Evaluation, methods: Sequence[Method], count: int) -> Ite
         for group, windows in sorted(by_group.items())
         for window, rows in islice(windows.items(), count)
     ]
-    by_name = {method.name: method for method in methods}
+    by_name = {row_of(method): method for method in reversed(methods)}
     for group, window, rows in track(chosen, "drawing", total=len(chosen)):
-        shown = [by_name[row.method] for row in rows]
+        shown = [by_name[row.method] for row in rows if not row.own]
         frames, fps = _strip(window, shown, rows[0].shape)
         columns = evaluation.headings(group)
         data = base64.b64encode(encode_video(frames, fps, crf=CRF)).decode()

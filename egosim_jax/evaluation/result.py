@@ -16,7 +16,7 @@ from egosim_jax.evaluation.metrics.report import (
     print_table,
     summarize,
 )
-from egosim_jax.evaluation.scoring import Protocol, Row, Scores, Scoring
+from egosim_jax.evaluation.scoring import OWN, Protocol, Row, Scores, Scoring, row_of
 
 KNOWN = {
     "depth_err": Column("Depth ERR of the paper", "{:.3f}", "lower"),
@@ -59,6 +59,8 @@ class Evaluation:
     """Measures that were not computed, with the reasons."""
     skipped: Sequence[str] = ()
     """Clips that were not compared, with the reasons."""
+    crops: Sequence[str] = ()
+    """Crops of the recorded images that the folders show, in words."""
 
     @classmethod
     def of(cls, scoring: Scoring, rows: Sequence[Row], **options: Any) -> Evaluation:
@@ -67,13 +69,16 @@ class Evaluation:
         definitions = {k: v for measure in scoring.measures for k, v in measure.definitions.items()}
         options.setdefault("shown", SHOWN)
         present = {row.method for row in rows}
+        titles = {row_of(method): method.title for method in scoring.methods}
+        titles |= {f"{name}{OWN}": f"{title}, in its own crop" for name, title in titles.items()}
         return cls(
             rows=rows,
-            titles={m.name: m.title for m in scoring.methods if m.name in present},
+            titles={name: title for name, title in titles.items() if name in present},
             columns=columns,
             definitions=definitions,
             protocol=scoring.protocol,
             skipped=scoring.skipped,
+            crops=scoring.crops,
             **options,
         )
 
@@ -109,6 +114,8 @@ class Evaluation:
         for group, by_method in self._grouped().items():
             start = {row.window: row.scores for row in by_method.get(reference, ())}
             for method in others:
+                if any(row.own for row in by_method.get(method, ())):
+                    continue
                 pairs = [(row.scores, start.get(row.window)) for row in by_method.get(method, ())]
                 shared = [(scores, at) for scores, at in pairs if at is not None]
                 if len(shared) > 1:
@@ -134,6 +141,8 @@ class Evaluation:
         places = {name: sorted(found) for name, found in starts.items()}
         scores: dict[str, dict[int, list[Scores]]] = {}
         for row in self.rows:
+            if row.own:
+                continue
             place = places[row.window.files.video_id].index(row.window.start)
             scores.setdefault(row.method, {}).setdefault(place, []).append(row.scores)
         return {
@@ -159,8 +168,8 @@ class Evaluation:
                 **self.definitions,
                 "spread": DEFINITIONS["spread"],
                 "frames": f"{self.protocol.first} to the last",
-                "differences": "from the first method on the same clips: mean and 95 % interval by "
-                "the paired bootstrap over clips",
+                "differences": "from the first method on the same clips: mean and Student's 95 % "
+                "interval of paired differences",
             },
             "protocol": {
                 "description": self.protocol.describe(),
@@ -169,6 +178,7 @@ class Evaluation:
                 "frames": [self.protocol.first, max(row.shape.frames for row in self.rows) - 1],
                 "last_frames": sorted({row.shape.frames - 1 for row in self.rows}),
                 "resize": FIT,
+                "crops": list(self.crops),
                 "lpips_alex": lpips.protocol(),
                 "unavailable": list(self.unavailable),
             },
@@ -243,6 +253,7 @@ class Evaluation:
         ]
         if "lpips_alex" in self.shown and "lpips_alex" not in self.definitions:
             lines.append(f"lpips_alex: {protocol['lpips_alex']}")
+        lines += [f"crop: {line}" for line in self.crops]
         lines += [f"unavailable: {line}" for line in self.unavailable]
         return lines + ([f"published: {self.source}"] if self.published else [])
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -19,17 +19,26 @@ import numpy as np
 
 from egosim_jax.data.clip_files import ClipFiles
 from egosim_jax.data.windows import Window, read_results
+from egosim_jax.evaluation.crops import find_crops
+from egosim_jax.evaluation.fvd import is_feature
 from egosim_jax.evaluation.measures import VERSION, GroundTruth, Measure, Scorer
 from egosim_jax.evaluation.methods import FIT, Folder, Method, Shape, read_at
+from egosim_jax.evaluation.registration import WHOLE, Crop
 from egosim_jax.io.atomic import append_line
 from egosim_jax.io.bounded import read_lines
 from egosim_jax.io.digest import fingerprint, sha256
-from egosim_jax.io.video import probe_video
+from egosim_jax.io.video import VideoInfo, probe_video
 from egosim_jax.runtime.progress import track
 from egosim_jax.types import InputError
 
+MAX_RATE_ERROR = 0.01
+"""Maximum relative difference of two frame rates that count as one, such as 29.97 and 30."""
+MIN_COMPARED_PX = 16
+"""Minimum height and width of the compared part of an image."""
 CACHE = "scores_cache.jsonl"
 """Name of the cache file in the folder of a report."""
+OWN = "_own"
+"""End of a row's name whose scores are in the method's own crop."""
 Scores = Mapping[str, float]
 """Values of one clip by measure."""
 
@@ -44,6 +53,10 @@ class Protocol:
     """Compared frames: all, for clips of the most frequent length; or all that every method has."""
     frame_0: bool = False
     """True to compare also frame 0, which is given to the model."""
+    registered: Literal["all", "sizes"] = "sizes"
+    """Folders whose crop of the recorded image is searched: all; or those of another image size.
+
+    All are also scored in their own crops."""
 
     @property
     def first(self) -> int:
@@ -57,7 +70,14 @@ class Protocol:
             "common": "the frames that all methods and the ground truth have",
         }[self.lengths]
         excluded = "frame 0 included" if self.frame_0 else "frame 0 excluded"
-        return f"frame by frame, {frames}, {excluded}; at the size of the {self.size}; {FIT}"
+        searched = {
+            "all": "every folder",
+            "sizes": "a folder whose images have another size than the ground truth's",
+        }[self.registered]
+        return (
+            f"frame by frame, {frames}, {excluded}; at the scale of the {self.size}, inside the "
+            f"crop that all folders show, which is found by correlation for {searched}; {FIT}"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +93,8 @@ class Row:
     source: str
     """Size and length of the method's own video as text."""
     scores: Scores
+    own: bool = False
+    """True for the scores in the method's own crop instead of the common one."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +138,8 @@ class Scoring:
     cache: ScoreCache
     skipped: list[str] = field(default_factory=list)
     """Clips that were not compared, with reasons."""
+    crops: list[str] = field(default_factory=list)
+    """Crops of the recorded images that the folders show, in words."""
 
     @property
     def folders(self) -> list[Folder]:
@@ -126,6 +150,14 @@ class Scoring:
         """Compare all clips. Raises `InputError` if none can be compared."""
         windows = self._windows(clips)
         lengths = {folder.name: self._lengths(folder, windows) for folder in self.folders}
+        for folder in self.folders:
+            found = find_crops(
+                folder,
+                lengths[folder.name],
+                cache=self.cache,
+                every=self.protocol.registered == "all",
+            )
+            self.crops.extend(found)
         rows: list[Row] = []
         for window in track(windows, "comparing", total=len(windows)):
             known = {name: of[window] for name, of in lengths.items() if window in of}
@@ -140,7 +172,7 @@ class Scoring:
         if not rows:
             shown = ", ".join(str(folder.path) for folder in self.folders)
             raise InputError(f"No clip in {shown} could be compared. (--generated)")
-        return rows
+        return _average(rows)
 
     def _windows(self, clips: Sequence[ClipFiles]) -> list[Window]:
         """Return the generated windows of the clips; note the reasons of missing ones."""
@@ -168,13 +200,12 @@ class Scoring:
                     )
         return list(windows.values())
 
-    def _lengths(self, folder: Folder, windows: Sequence[Window]) -> dict[Window, Shape]:
+    def _lengths(self, folder: Folder, windows: Sequence[Window]) -> dict[Window, VideoInfo]:
         """Return length and size of a folder's clips; note those that are not compared."""
-        lengths: dict[Window, Shape] = {}
+        lengths: dict[Window, VideoInfo] = {}
         for window in windows:
             try:
-                video = probe_video(folder.file(window))
-                lengths[window] = Shape(video.frames, video.height, video.width)
+                lengths[window] = probe_video(folder.file(window))
             except InputError as error:
                 self.skipped.append(f"{window.output_id}: {error}")
         if self.protocol.lengths == "common":
@@ -190,7 +221,7 @@ class Scoring:
         )
         return {window: shape for window, shape in lengths.items() if shape.frames == usual}
 
-    def _compare(self, window: Window, known: Mapping[str, Shape]) -> list[Row]:
+    def _compare(self, window: Window, known: Mapping[str, VideoInfo]) -> list[Row]:
         """Return the scores of every method on one window."""
         path = window.files.target
         if path is None:
@@ -201,21 +232,64 @@ class Scoring:
             count = min(count, truth.frames - window.start)
         if count <= self.protocol.first:
             raise InputError("There are no frames to compare.")
-        like = truth if self.protocol.size == "target" else next(iter(known.values()))
-        shape = Shape(count, like.height, like.width)
-        truth = _Truth(path, window, shape, self.protocol.first)
-        rows = []
+        methods = []
         for method in self.methods:
-            own = known.get(method.name)
             absent = isinstance(method, Folder) and not method.file(window).exists()
-            if absent or (method in self.folders and own is None):
+            if absent or (method in self.folders and method.name not in known):
                 continue
-            source = f"{own.frames} x {own.width}x{own.height}" if own else "made here"
-            scores = self._scores(method, truth)
-            rows.append(
-                Row(window=window, method=method.name, shape=shape, source=source, scores=scores)
-            )
+            for source in method.sources(window):
+                _check_rate(method.name, source, probe_video(source), path, truth)
+            methods.append(method)
+        crops = {m.name: m.crops.get(window.output_id, WHOLE) for m in self.folders}
+        common = WHOLE
+        for name in known:
+            common = common.common(crops[name])
+        like = truth if self.protocol.size == "target" else next(iter(known.values()))
+        shown = WHOLE if self.protocol.size == "target" else crops[next(iter(known))]
+        all_rows = [(self._shape(count, common, like, shown, truth), methods, False)]
+        if self.protocol.registered == "all":
+            for method in methods:
+                own = crops.get(method.name, WHOLE).common(WHOLE)
+                if isinstance(method, Folder) and own != common:
+                    shape = self._shape(count, own, like, shown, truth)
+                    all_rows.append((shape, [method], True))
+        rows = []
+        for shape, scored, own in all_rows:
+            compared = _Truth(path, window, shape, self.protocol.first)
+            for method in scored:
+                video = known.get(method.name)
+                rows.append(
+                    Row(
+                        window=window,
+                        method=row_of(method) + OWN * own,
+                        shape=shape,
+                        source=f"{video.frames} x {video.width}x{video.height}"
+                        if video
+                        else "made here",
+                        scores=self._scores(method, compared),
+                        own=own,
+                    )
+                )
         return rows
+
+    @staticmethod
+    def _shape(count: int, crop: Crop, like: VideoInfo, shown: Crop, truth: VideoInfo) -> Shape:
+        """Return the shape at which a crop is compared, at the scale of `like`.
+
+        The images of `like` show the part `shown` of the recorded image.
+        """
+        if crop == shown:
+            return Shape(count, like.height, like.width, crop)
+        crop = crop.whole_pixels(truth.height, truth.width)
+        left, top, right, bottom = crop.within(shown)
+        height, width = round((bottom - top) * like.height), round((right - left) * like.width)
+        if min(height, width) < MIN_COMPARED_PX:
+            raise InputError(
+                "The folders show parts of the recorded image that have too little in common: "
+                f"{max(width, 0)}x{max(height, 0)} pixels, fewer than {MIN_COMPARED_PX}. Score "
+                "them in separate commands. (--generated)"
+            )
+        return Shape(count, height, width, crop)
 
     def _scores(self, method: Method, truth: _Truth) -> Scores:
         """Return the scores of a method on one window, cached or computed."""
@@ -227,6 +301,7 @@ class Scoring:
             "first": truth.first,
             "method": type(method).__name__ if isinstance(method, Folder) else method,
             "sources": [sha256(path) for path in method.sources(truth.window)],
+            "shown": method.crops.get(truth.window.output_id) if isinstance(method, Folder) else (),
         }
         video: np.ndarray | None = None
         scores: dict[str, float] = {}
@@ -254,10 +329,50 @@ class _Truth:
     def known(self) -> GroundTruth:
         """Decoded frames."""
         frames = read_at(self.path, self.shape, self.window.start)
-        return GroundTruth(frames=frames, first=self.first, window=self.window)
+        crop = self.shape.crop
+        return GroundTruth(frames=frames, first=self.first, window=self.window, crop=crop)
 
     def scorer(self, measure: Measure) -> Scorer:
         """Return the scorer of a measure, made once."""
         if id(measure) not in self._scorers:
             self._scorers[id(measure)] = measure.against(self.known)
         return self._scorers[id(measure)]
+
+
+def row_of(method: Method) -> str:
+    """Return the name of a method's row."""
+    return method.row if isinstance(method, Folder) else method.name
+
+
+def _check_rate(name: str, path: Path, own: VideoInfo, target: Path, truth: VideoInfo) -> None:
+    """Raise `InputError` if two videos differ in their frame rate."""
+    if abs(own.fps / truth.fps - 1) > MAX_RATE_ERROR:
+        slower, rate = (target, own.fps) if own.fps < truth.fps else (path, truth.fps)
+        raise InputError(
+            f"{name} has {float(own.fps):g} frames a second, the ground truth "
+            f"{float(truth.fps):g}: frames are compared one by one, so both need one rate. Convert "
+            f"the faster one with `ffmpeg -i {slower.name} -vf fps={rate} -crf 0 slower.mp4`. "
+            "(--generated, column video)"
+        )
+
+
+def _average(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows with the mean scores over the seeds of a method.
+
+    Features for a Fréchet distance are the first seed's: their mean is no clip's.
+    """
+    by_row: dict[tuple[Window, str], list[Row]] = {}
+    for row in rows:
+        by_row.setdefault((row.window, row.method), []).append(row)
+    return [
+        replace(
+            same[0],
+            scores={
+                key: value if is_feature(key) else float(np.mean([row.scores[key] for row in same]))
+                for key, value in same[0].scores.items()
+            },
+        )
+        if len(same) > 1
+        else same[0]
+        for same in by_row.values()
+    ]

@@ -32,8 +32,8 @@ METHODS: dict[str, str | None] = {
 }
 """Method -> perception pipeline."""
 DIFFERENCES = {
-    "differences": "from no update, clip by clip of the same sequences; mean and 95 % interval by "
-    "the paired bootstrap"
+    "differences": "from no update, clip by clip of the same sequences; mean and Student's 95 % "
+    "interval of paired differences"
 }
 
 
@@ -121,7 +121,7 @@ def draw_curves(tables: Mapping[str, Sequence[Summary]], path: Path) -> None:
         for method, table in tables.items():
             numbers = range(1, len(table) + 1)
             means = [row[measure]["mean"] for row in table]
-            errors = [row[measure]["spread"] for row in table]
+            errors = [row[measure].get("spread", 0.0) for row in table]
             axes.errorbar(numbers, means, yerr=errors, marker="o", capsize=3, label=method)
         axes.set_title(title)
         axes.set_xlabel("clip")

@@ -55,7 +55,7 @@ REPORT_DEFINITIONS = {
     **DEFINITIONS,
     "spread": "standard deviation over scenes (n - 1), each a mean over seeds",
     "differences": "DWM minus the row, of the means over seeds of each scene; mean over scenes and "
-    "95 % interval by the paired bootstrap",
+    "Student's 95 % interval of paired differences",
     "paper": "figures of Kim et al. 2026, on other data: only their order can be compared",
 }
 

@@ -73,7 +73,7 @@ DEFINITIONS = {
     "seen, unseen": "the object is carried in view, or while the wearer looks elsewhere",
     "ground truth": "frames of the true world, which test the detection of the object, and the "
     "state by classical perception of them",
-    "differences": "from no update, on the same scenes; mean and 95 % interval",
+    "differences": "from no update, on the same scenes; mean and Student's 95 % interval",
 }
 
 

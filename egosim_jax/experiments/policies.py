@@ -267,7 +267,7 @@ def _report(out: Path, found: Mapping[str, Sequence[Outcomes]], *, judges: Seque
     report = {"definitions": DEFINITIONS, "scenes": scenes, "table": rows, "agreement": agreement}
     write_json(out / "report.json", report)
     print_table("policy", rows, MEASURES, title=f"success in {scenes} scenes")
-    title = "agreement with true success, with its 95 % interval"
+    title = "agreement with true success, with 95 % intervals"
     print_table("success read from", agreement, rank_correlation.MEASURES, title=title)
     _plot(rows, out / "ranking.png", judges)
 

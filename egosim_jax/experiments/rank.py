@@ -26,7 +26,7 @@ DEFINITIONS = {
     "top1": "share of goals whose action has the highest score, in percent; 95 % interval of "
     "Clopper and Pearson",
     "spearman": "rank correlation between the scores of a goal's candidates and the scores of "
-    "their true videos; mean over goals, 95 % interval of the bootstrap over goals",
+    "their true videos; mean over goals, Student's 95 % interval over goals",
 }
 MAX_TRIES = 200
 """Maximum number of actions of a scene to try for different ones."""

@@ -47,7 +47,7 @@ SPREAD = {
 }
 DIFFERENCES = {
     "differences": "of the means over seeds of each scene, without a condition minus with all; "
-    "mean over scenes and 95 % interval by the paired bootstrap"
+    "mean over scenes and Student's 95 % interval of paired differences"
 }
 
 
@@ -211,7 +211,7 @@ def summarize_runs(
     scenes = over_seeds(runs)
     seeds = summarize([_means(scores) for scores in runs], MEASURES)
     return {
-        name: {**summary, "spread_over_seeds": seeds[name]["spread"]}
+        name: {**summary, "spread_over_seeds": seeds[name].get("spread", np.nan)}
         for name, summary in summarize(scenes, MEASURES).items()
     }
 

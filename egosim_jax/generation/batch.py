@@ -225,6 +225,12 @@ class BatchJob:
                 policy=self.policy,
                 grid=self.model.grid,
             )
+            target = window.files.target
+            if self.reconstruct and (target is None or not target.exists()):
+                problems.append(
+                    "without ground truth nothing can be reconstructed: add its video (column "
+                    "video), or omit --reconstruct."
+                )
             if problems:
                 rejected.append((window, listing(problems)))
             else:

@@ -84,12 +84,20 @@ def by_text(goal: str, folder: Path | None) -> Score:
 
 
 def order(scores: Mapping[str, Sequence[float]]) -> list[Ranked]:
-    """Return the candidates, best first, from their scores by name."""
+    """Return the candidates, best first, from their scores by name.
+
+    Equal means share a rank. Candidates whose mean is NaN are last.
+    """
     means = {name: float(np.mean(values)) for name, values in scores.items()}
-    best = sorted(means, key=lambda name: -means[name])
+    keys = {name: np.inf if np.isnan(mean) else -mean for name, mean in means.items()}
+    best = sorted(keys, key=lambda name: (keys[name], np.isnan(means[name])))
     return [
-        Ranked(name=name, scores=tuple(scores[name]), rank=place)
-        for place, name in enumerate(best, start=1)
+        Ranked(
+            name=name,
+            scores=tuple(scores[name]),
+            rank=1 + sum(key < keys[name] for key in keys.values()),
+        )
+        for name in best
     ]
 
 
@@ -122,7 +130,8 @@ def rank(jobs: Sequence[BatchJob], windows: Sequence[Window], score: Score) -> l
 def report(ranked: Sequence[Ranked], out: Path, *, goal: str, measure: str) -> None:
     """Write ranking.json and print the ranking."""
     rows = [{"name": r.name, "rank": r.rank, "score": r.score, "scores": r.scores} for r in ranked]
-    content = {"goal": goal, "measure": measure, "best": ranked[0].name, "candidates": rows}
+    best = None if np.isnan(ranked[0].score) else ranked[0].name
+    content = {"goal": goal, "measure": measure, "best": best, "candidates": rows}
     write_json(out / "ranking.json", content)
     table = {}
     for one in ranked:

@@ -30,3 +30,14 @@ def time_sinusoid(t: Float[Array, " b"], dim: int) -> Float[Array, "b d"]:
     rest = (t - nearest)[:, None] * jnp.asarray(frequency, jnp.float32)
     cos_r, sin_r = jnp.cos(rest), jnp.sin(rest)
     return jnp.concatenate([cos_n * cos_r - sin_n * sin_r, sin_n * cos_r + cos_n * sin_r], axis=-1)
+
+
+def float32_sinusoid(t: Float[Array, " b"], dim: int) -> Float[Array, "b d"]:
+    """Cosines, then sines, of float32 products of t and frequency, as diffusers computes them.
+
+    At t = 999 they differ from the exact ones by up to 6e-5.
+    """
+    places = np.arange(dim // 2, dtype=np.float32)
+    exponent = np.float32(-np.log(10000.0)) * places / np.float32(dim // 2)
+    angle = t.astype(jnp.float32)[:, None] * jnp.asarray(np.exp(exponent), jnp.float32)
+    return jnp.concatenate([jnp.cos(angle), jnp.sin(angle)], axis=-1)

@@ -30,6 +30,8 @@ DEFINITIONS = {
     "depth_known": "share in percent of those pixels where the state after the clip has a point",
     "camera_error": "root mean square distance in mm between the cameras estimated from the "
     "generated frames (flow from the ground-truth frames, PnP with their depth) and the true ones",
+    "camera_known": "share in percent of the frames whose camera was found, which camera_error "
+    "averages",
 }
 """Definition of each measure, for reports."""
 
@@ -60,5 +62,7 @@ def score_step(
         path = estimate_cameras(frames, ground_truth.frames, depth_m, ~acted, cameras)
         scores["depth_error"] = depth_error(after.depth_m, depth_m, last)
         scores["depth_known"] = coverage(after.depth_m, last)
+        found = np.isfinite(path).all(axis=(1, 2))
+        scores["camera_known"] = 100 * float(found.mean())
         scores["camera_error"] = 1000 * camera_errors(path, cameras.world_from_camera)[0]
     return scores

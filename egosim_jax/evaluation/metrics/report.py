@@ -34,11 +34,11 @@ def score(
 def mean_and_spread(values: Iterable[float]) -> tuple[float, float]:
     """Return mean and standard deviation (n - 1) of the finite values.
 
-    The mean of no values is NaN; the deviation of fewer than two values is 0.
+    The mean of no values is NaN, and so is the deviation of fewer than two values.
     """
     known = [value for value in values if np.isfinite(value)]
     mean = float(np.mean(known)) if known else float("nan")
-    return mean, float(np.std(known, ddof=1)) if len(known) > 1 else 0.0
+    return mean, float(np.std(known, ddof=1)) if len(known) > 1 else float("nan")
 
 
 def summarize(
@@ -46,8 +46,8 @@ def summarize(
 ) -> dict[str, dict[str, float]]:
     """Return mean and spread over scores of each measure that any score has.
 
-    If some scores are not finite, `known` counts the finite ones and `of` counts all: the mean
-    alone would hide failures.
+    A single value has no spread. If some scores are not finite, `known` counts the finite ones and
+    `of` counts all: the mean alone would hide failures.
     """
     summary = {}
     for name in measures:
@@ -57,7 +57,8 @@ def summarize(
         mean, spread = mean_and_spread(values)
         known = int(np.isfinite(values).sum())
         counts = {} if known == len(values) else {"known": known, "of": len(values)}
-        summary[name] = {"mean": mean, "spread": spread, **counts}
+        spreads = {"spread": spread} if known > 1 else {}
+        summary[name] = {"mean": mean, **spreads, **counts}
     return summary
 
 
@@ -76,28 +77,25 @@ def paired_differences(
 
 
 def paired_difference(
-    values: Sequence[float],
-    reference: Sequence[float],
-    level: float = 0.95,
-    *,
-    resamples: int = 10_000,
+    values: Sequence[float], reference: Sequence[float], level: float = 0.95
 ) -> dict[str, float]:
-    """Return the mean of `values - reference` over pairs and its bootstrap confidence interval.
+    """Return the mean of `values - reference` over pairs and its confidence interval.
 
-    The bootstrap resamples pairs with a fixed seed; the interval is between percentiles of their
-    means. Pairs with NaN are ignored, and then counted by `known` and `of`. Fewer than two pairs
-    have an infinite interval. Source: Efron and Tibshirani, An Introduction to the Bootstrap, 1993,
-    section 13.3.
+    The interval is Student's: mean ± t s / sqrt(n). A bootstrap of so few pairs is too narrow: at
+    n = 5, its 95 % interval has the true mean in 84 % of the cases, Student's in 95 % (normal
+    differences) or 88 % (exponential ones). Pairs with NaN are ignored, and then counted by `known`
+    and `of`. Fewer than two pairs have no interval.
     """
+    from scipy.special import stdtrit
+
     pairs = np.subtract(values, reference)
     known = pairs[~np.isnan(pairs)]
     counts = {} if len(known) == len(pairs) else {"known": len(known), "of": len(pairs)}
+    mean, spread = mean_and_spread(known)
     if len(known) < 2:
-        mean = float(known.mean()) if len(known) else float("nan")
-        return {"mean": mean, "low": -np.inf, "high": np.inf, **counts}
-    draws = np.random.default_rng(0).integers(len(known), size=(resamples, len(known)))
-    low, high = np.quantile(known[draws].mean(axis=1), [(1 - level) / 2, (1 + level) / 2])
-    return {"mean": float(known.mean()), "low": float(low), "high": float(high), **counts}
+        return {"mean": mean, **counts}
+    half = float(stdtrit(len(known) - 1, (1 + level) / 2)) * spread / len(known) ** 0.5
+    return {"mean": mean, "low": mean - half, "high": mean + half, **counts}
 
 
 def print_table(
@@ -122,9 +120,12 @@ def print_table(
 
 def cell_of(value: Mapping[str, float], form: str) -> str:
     """Return a cell of a table, for instance "0.25 ± 0.04 (3 of 5)"."""
-    text = " ± ".join(form.format(value[key]) for key in ("mean", "spread") if key in value)
-    if "low" in value:
+    if np.isnan(value.get("mean", 0.0)):
+        return f"no clips (0 of {value['of']})" if value.get("known") == 0 else "undefined"
+    shown = (value[key] for key in ("mean", "spread") if np.isfinite(value.get(key, np.nan)))
+    text = " ± ".join(form.format(number) for number in shown)
+    if np.isfinite(value.get("low", np.nan)):
         text = f"{text} [{form.format(value['low'])}, {form.format(value['high'])}]"
-    if "spread_over_seeds" in value:
+    if np.isfinite(value.get("spread_over_seeds", np.nan)):
         text = f"{text} (± {form.format(value['spread_over_seeds'])})"
     return f"{text} ({value['known']} of {value['of']})" if "known" in value else text

@@ -17,6 +17,8 @@ from egosim_jax.types import Cameras
 
 MAX_KEYPOINTS = 800
 """Maximum number of tracked points, chosen by image gradient."""
+MIN_EXTENT = 1e-3
+"""Minimum distance of a camera from the first one, in units of the path, that is no jitter."""
 MIN_INLIERS = 12
 """Minimum number of points for a pose."""
 INLIER_THRESHOLD_PX = 1.0
@@ -99,7 +101,8 @@ def camera_errors(
 ) -> tuple[float, float]:
     """Return the RMS errors of position in meters and of rotation in degrees.
 
-    Frames without a finite pose are ignored. NaN if no pose is finite.
+    Frames without a finite pose are ignored; their number belongs beside the errors. NaN if no pose
+    is finite.
     """
     known = np.isfinite(world_from_camera).all(axis=(1, 2))
     if not known.any():
@@ -126,10 +129,10 @@ def path_errors(
     """Return the errors of a path relative to its first camera, independent of its scale.
 
     The extent of a path is the maximum distance from its first camera, or 1 if it does not move.
-    Frames without a finite pose are ignored. NaN if the first pose is not finite.
+    Frames without a finite pose are ignored. NaN if the first pose is not finite, or no other is.
     """
     known = np.asarray(np.isfinite(world_from_camera).all(axis=(1, 2)))
-    if not known[0]:
+    if not known[0] or known.sum() < 2:
         return PathErrors(float("nan"), float("nan"), float("nan"))
     found, wanted = (invert(p[0]) @ p[known] for p in (world_from_camera, target))
     between = invert(wanted) @ found
@@ -145,7 +148,8 @@ def path_errors(
 
 def _extent(positions: Float[np.ndarray, "f 3"]) -> float:
     """Return the maximum distance from the first camera, or 1 for a camera that does not move."""
-    return float(np.linalg.norm(positions, axis=1).max()) or 1.0
+    extent = float(np.linalg.norm(positions, axis=1).max())
+    return extent if extent > MIN_EXTENT else 1.0
 
 
 def _angles_deg(a_from_b: Float[np.ndarray, "f 4 4"]) -> Float[np.ndarray, " f"]:

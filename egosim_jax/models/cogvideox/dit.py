@@ -42,7 +42,13 @@ class CogVideoXDiTConfig(CogVideoXDiTSizes):
 
     table: ClassVar[str] = "egosim_jax.convert.tables.cogvideox_dit"
     """Module of the conversion table."""
-    numerics_only: ClassVar[tuple[str, ...]] = ("dtype", "products", "attention", "remat")
+    numerics_only: ClassVar[tuple[str, ...]] = (
+        "dtype",
+        "products",
+        "attention",
+        "remat",
+        "time_angles",
+    )
     """Fields that change only how values are computed, which a resumed training may change."""
     remat_levels: ClassVar[tuple[str, ...]] = remat.LEVELS
     """Values of `remat`, by the memory that they take, ascending."""

@@ -27,7 +27,7 @@ from egosim_jax.models import rope
 from egosim_jax.models.attention import Kernel, attention
 from egosim_jax.models.layers import LayerNorm, Linear, Products, modulate
 from egosim_jax.models.remat import Level, name_projection
-from egosim_jax.models.sinusoid import time_sinusoid
+from egosim_jax.models.sinusoid import float32_sinusoid, time_sinusoid
 from egosim_jax.types import InputError, check_counts
 
 PATCH = 2
@@ -68,6 +68,8 @@ class CogVideoXDiTSizes:
     With bfloat16 sums and all else stay in `dtype`."""
     attention: Kernel = "auto"
     """Attention kernel of the transformer."""
+    time_angles: Literal["exact", "float32"] = "exact"
+    """Angles of the time embedding: exact, or products in float32 as in diffusers."""
     remat: Level = "none"
     """Activations that the backward pass recomputes."""
 
@@ -211,6 +213,7 @@ class TimeEmbedding(nnx.Module):
     """Embedding of timesteps in float32."""
 
     def __init__(self, config: CogVideoXDiTSizes, *, rngs: nnx.Rngs):
+        self.sinusoid = {"exact": time_sinusoid, "float32": float32_sinusoid}[config.time_angles]
         self.dim = config.dim
         dim, hidden, dtype = config.dim, config.time_dim, config.dtype
         self.up = Linear(dim, hidden, axes=("embed", None), dtype=dtype, rngs=rngs)
@@ -218,5 +221,5 @@ class TimeEmbedding(nnx.Module):
 
     def __call__(self, t: Float[Array, " b"]) -> Float[Array, "b e"]:
         """Embed timesteps in [0, 1000]."""
-        hidden = jax.nn.silu(self.up(time_sinusoid(t, self.dim)))
+        hidden = jax.nn.silu(self.up(self.sinusoid(t, self.dim)))
         return self.down(hidden).astype(jnp.float32)

@@ -1,7 +1,8 @@
 """Causal video VAE of CogVideoX: 4 x 8 x 8 pixels to one latent cell of 16 channels.
 
 A video of 8k+1 frames becomes 2k+1 latent frames. It is coded in chunks: 9 frames, then 8 at a
-time, to 3 latent frames, then 2; a single frame is a chunk by itself. The chunks are part of the
+time, to 3 latent frames, then 2; a single frame is a chunk by itself. VideoX-Fun has decoded 1
+latent frame, then 2 at a time, since December 2024 (`decode_first`). The chunks are part of the
 numerics: group norms take their statistics over a chunk, and only the convolutions over time see
 the frames before it, in their cache. So memory does not grow with the length of a clip.
 
@@ -19,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -65,6 +66,8 @@ class CogVideoXVAEConfig:
     """Epsilon of the norms."""
     scale: float = 0.7
     """Factor of the latents that `encode` gives."""
+    decode_first: Literal[1, 3] = 3
+    """Latent frames of the first decoded chunk: 3 in diffusers, 1 in VideoX-Fun."""
     dtype: str = "float32"
     """Dtype of the convolutions; norms are computed in float32."""
 
@@ -295,7 +298,7 @@ class CogVideoXVAE(nnx.Module):
 
     def decode_whole(self, latents: Float[Array, "b f h w z"]) -> Float[Array, "b f2 h2 w2 3"]:
         """Return the video of unscaled latents, not clipped, for training; also in chunks."""
-        video = _by_chunk(self.decoder, latents, first=CHUNK + 1, size=CHUNK)
+        video = _by_chunk(self.decoder, latents, first=self.config.decode_first, size=CHUNK)
         return video.astype(jnp.float32)
 
     def normalize(self, mean: Float[Array, "*b z"]) -> Float[Array, "*b z"]:

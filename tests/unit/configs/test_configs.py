@@ -49,7 +49,9 @@ def test_egosim_14b_turns_on_the_quirks_of_the_release():
 def test_dwm_is_sampled_as_released_or_as_for_the_paper():
     config = configs.get("dwm_cogvideox_5b")
     assert configs.sampled(config, "released") == config
+    assert (config.vae.decode_first, config.dit.time_angles) == (3, "float32")
     paper = configs.sampled(config, "paper")
+    assert paper.vae.decode_first == 1
     assert paper.solver.stochastic
     assert paper.unconditional_prompt.startswith("The video is not of a high quality")
     assert paper.encoding_noise.prior_pixels == 0.0563

@@ -1,5 +1,6 @@
 """Measures from estimates, with estimators of known results."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -122,6 +123,18 @@ def test_a_camera_that_stays_has_no_translation_error(truth):
     video = still + np.arange(9, dtype=np.uint8)[:, None, None, None]
     scores = CameraError(cameras_by_level).against(truth)(video)
     assert scores["camera_rotation"] == pytest.approx(0, abs=1e-6)
+    assert np.isnan([scores["camera_error"], scores["camera_ate"]]).all()
+
+
+def test_a_camera_that_jitters_by_a_micrometer_has_no_translation_error(truth):
+    def jittering(frames, moving, **_):
+        estimate = cameras_by_level(frames, moving)
+        poses = estimate.cameras.world_from_camera * 1.0
+        poses[1:, :3, 3] = 1e-6 * np.random.default_rng(0).normal(size=(len(poses) - 1, 3))
+        cameras = replace(estimate.cameras, world_from_camera=poses)
+        return replace(estimate, cameras=cameras)
+
+    scores = CameraError(jittering).against(truth)(truth.frames)
     assert np.isnan([scores["camera_error"], scores["camera_ate"]]).all()
 
 

@@ -20,6 +20,14 @@ def test_the_candidate_with_the_highest_mean_score_is_first():
     assert found[0].score == pytest.approx(0.3)
 
 
+def test_equal_candidates_share_a_rank_and_those_without_a_score_are_last():
+    nan = float("nan")
+    scores = {"none": (nan, 1.0), "a": (0.5, 0.5), "b": (0.9, 0.1), "c": (0.1, 0.1), "no": (nan,)}
+    found = {one.name: one.rank for one in rank.order(scores)}
+    assert found == {"a": 1, "b": 1, "c": 3, "none": 4, "no": 4}
+    assert list(found)[-2:] == ["none", "no"]
+
+
 @pytest.fixture(autouse=True)
 def generated_clips_show_the_hands(monkeypatch):
     shown.show_hands(monkeypatch)

@@ -1,21 +1,40 @@
-"""The time sinusoid against float64."""
+"""Sinusoids of the diffusion time, against other formulas."""
 
-import math
-
-import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from egosim_jax.models.sinusoid import time_sinusoid
+from egosim_jax.models.sinusoid import float32_sinusoid, time_sinusoid
 
-ROUNDING = 3e-7
-"""Three float32 roundings of numbers up to 1, where naive float32 angles err by 3e-5."""
+TIMES = [0.0, 1.0, 19.0, 333.0, 761.5, 980.0, 999.0]
 
 
-@pytest.mark.parametrize("time", [0, 0.25, 92.6, 499.5, 500, 871.23, 999.97, 1000])
-def test_time_sinusoid_is_exact_to_float32_rounding(time):
-    t = np.float32(time)
-    have = np.asarray(jax.jit(time_sinusoid, static_argnums=1)(t[None], 256))[0]
-    angles = [float(t) * 10000 ** (-i / 128) for i in range(128)]
-    want = [math.cos(a) for a in angles] + [math.sin(a) for a in angles]
-    np.testing.assert_allclose(have, want, rtol=0, atol=ROUNDING)
+def in_float32(times, dim):
+    """Return cosines and sines of angles of which every step is rounded to float32."""
+    rows = []
+    for time in times:
+        angles = []
+        for place in range(dim // 2):
+            exponent = np.float32(np.float32(-np.log(10000.0)) * np.float32(place))
+            frequency = np.float32(np.exp(np.float64(np.float32(exponent / np.float32(dim // 2)))))
+            angles.append(np.float32(np.float32(time) * frequency))
+        angles = np.array(angles, np.float64)
+        rows.append(np.concatenate([np.cos(angles), np.sin(angles)]))
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("dim", [64, 256, 3072])
+def test_float32_angles_are_rounded_as_in_diffusers(dim):
+    found = np.asarray(float32_sinusoid(jnp.asarray(TIMES), dim))
+    # A frequency may be rounded up or down, which is a unit of the angle.
+    np.testing.assert_allclose(found, in_float32(TIMES, dim), atol=7e-5)
+    assert np.mean(np.abs(found - in_float32(TIMES, dim))) < 1e-6
+
+
+def test_exact_angles_differ_from_float32_ones():
+    exact = np.asarray(time_sinusoid(jnp.asarray([999.0]), 3072))
+    frequency = 10000.0 ** (-np.arange(1536) / 1536)
+    true = np.concatenate([np.cos(999 * frequency), np.sin(999 * frequency)])
+    np.testing.assert_allclose(exact[0], true, atol=3e-7)
+    rounded = np.asarray(float32_sinusoid(jnp.asarray([999.0]), 3072))[0]
+    assert 1e-5 < np.abs(rounded - true).max() < 1e-4

@@ -32,6 +32,8 @@ def test_mmrv_is_zero_for_equal_rankings_and_large_for_reversed_ones():
 
 def test_constant_success_has_no_correlation():
     assert np.isnan(pearson(np.ones(4), np.arange(4.0)))
+    assert np.isnan(pearson(np.full(7, 0.1), np.arange(7.0)))  # whose mean is not exactly 0.1
+    assert np.isnan(pearson(np.arange(7.0), np.full(7, 1 / 3)))
     assert np.isnan(spearman(np.ones(4), np.arange(4.0)))
 
 
@@ -46,9 +48,10 @@ def test_intervals_contain_the_value_and_shrink_with_scenes():
 
     few, many = found(12), found(200)
     for result in (few, many):
-        for value in result.values():
-            assert value["low"] <= value["mean"] <= value["high"] or value is result["mmrv"]
-    gap = {name: value["high"] - value["low"] for name, value in few.items()}
+        value = result["pearson"]
+        assert value["low"] <= value["mean"] <= value["high"]
+        assert result["spearman"].keys() == {"mean"}  # no interval
+    gap = {name: value["high"] - value["low"] for name, value in few.items() if "low" in value}
     assert many["pearson"]["high"] - many["pearson"]["low"] < gap["pearson"]
 
 
@@ -57,3 +60,27 @@ def test_perfect_agreement_is_one_and_zero():
     result = agreement(true, true, resamples=100)
     assert result["pearson"]["mean"] == result["spearman"]["mean"] == pytest.approx(1)
     assert result["mmrv"] == {"mean": 0, "low": 0, "high": 0}
+
+
+@pytest.mark.parametrize(("policies", "scenes"), [(8, 12), (8, 24), (5, 48)])
+@pytest.mark.parametrize("case", ["far apart", "alike", "one noise"])
+def test_intervals_have_the_value_over_all_scenes_as_often_as_they_say(policies, scenes, case):
+    rng = np.random.default_rng(policies * scenes)
+    wobble = np.sin(3 * np.arange(policies))
+    chance = np.linspace(*((0.3, 0.7) if case == "alike" else (0.1, 0.9)), policies)
+    expected = np.clip(0.5 + 0.6 * (chance - 0.5) + 0.15 * wobble, 0.03, 0.97)
+    shared = 0.6 if case == "one noise" else 0.0
+    value = pearson(shared * chance + (1 - shared) * expected, chance)
+    hits, repetitions = 0, 300
+    for _ in range(repetitions):
+        true = (rng.random((policies, scenes)) < chance[:, None]).astype(float)
+        own = (rng.random((policies, scenes)) < expected[:, None]).astype(float)
+        generated = np.where(rng.random((policies, scenes)) < shared, true, own)
+        found = agreement(generated, true, resamples=1)["pearson"]
+        hits += found["low"] <= value <= found["high"]
+    assert hits / repetitions >= 0.9
+
+
+def test_two_scenes_give_no_interval():
+    found = agreement(np.eye(3)[:, :2], np.eye(3)[:, :2])
+    assert all(value.keys() == {"mean"} for value in found.values())

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
-from scipy.stats import bootstrap
+from scipy.stats import ttest_1samp
 
 from egosim_jax.evaluation.metrics.report import (
+    cell_of,
     mean_and_spread,
     paired_difference,
     print_table,
@@ -22,7 +23,8 @@ def test_a_summary_is_mean_and_sample_deviation():
 
 
 def test_a_single_clip_has_no_spread():
-    assert summarize([{"psnr": 20.0}], ("psnr",))["psnr"]["spread"] == 0.0
+    assert summarize([{"psnr": 20.0}], ("psnr",))["psnr"] == {"mean": 20.0}
+    assert np.isnan(mean_and_spread([20.0])[1])
 
 
 def test_what_is_not_finite_is_ignored():
@@ -30,16 +32,34 @@ def test_what_is_not_finite_is_ignored():
     assert np.isnan(mean_and_spread([np.nan])[0])
 
 
-def test_a_paired_difference_has_the_interval_of_scipys_bootstrap():
+def test_a_paired_difference_has_the_interval_of_scipys_t_test():
     rng = np.random.default_rng(1)
-    pairs = rng.normal(1.0, 2.0, 30)
-    found = paired_difference([*pairs, np.nan], [0.0] * 31)
-    expected = bootstrap(
-        (pairs,), np.mean, n_resamples=10_000, method="percentile", rng=np.random.default_rng(2)
-    ).confidence_interval
-    assert found["mean"] == pytest.approx(pairs.mean())
-    # Quantiles of 10,000 draws differ by about a hundredth of the interval.
-    assert (found["low"], found["high"]) == pytest.approx((expected.low, expected.high), abs=0.03)
+    for count in (2, 5, 30):
+        pairs = rng.normal(1.0, 2.0, count)
+        found = paired_difference([*pairs, np.nan], [0.0] * (count + 1))
+        expected = ttest_1samp(pairs, 0).confidence_interval()
+        assert found["mean"] == pytest.approx(pairs.mean())
+        assert (found["low"], found["high"]) == pytest.approx((expected.low, expected.high))
+
+
+COVERAGE = {
+    "normal": (lambda rng, size: rng.normal(0, 1, size), 0.93),
+    "uniform": (lambda rng, size: rng.uniform(-1, 1, size), 0.92),
+    "Laplace": (lambda rng, size: rng.laplace(0, 1, size), 0.93),
+    "skewed": (lambda rng, size: rng.exponential(1, size) - 1, 0.86),
+}
+
+
+@pytest.mark.parametrize("count", [2, 3, 5, 8, 13, 24])
+@pytest.mark.parametrize("name", COVERAGE)
+def test_an_interval_has_the_true_mean_as_often_as_it_says(name, count):
+    draw, least = COVERAGE[name]
+    samples = draw(np.random.default_rng(count), (4000, count))
+    intervals = [paired_difference(sample, [0.0] * count) for sample in samples]
+    share = np.mean([found["low"] <= 0 <= found["high"] for found in intervals])
+    assert least <= share <= 0.98
+    if name == "normal":
+        assert share <= 0.96
 
 
 def test_pairs_share_what_varies_between_clips():
@@ -49,7 +69,7 @@ def test_pairs_share_what_varies_between_clips():
 
 
 def test_a_single_pair_excludes_nothing():
-    assert paired_difference([3.0], [2.0]) == {"mean": 1.0, "low": -np.inf, "high": np.inf}
+    assert paired_difference([3.0], [2.0]) == {"mean": 1.0}  # no interval
 
 
 def test_an_interval_is_in_brackets(capsys):
@@ -74,3 +94,24 @@ def test_missing_values_are_counted(capsys):
     assert "21.0 ± 1.4 (2 of 3)" in capsys.readouterr().out
     difference = paired_difference([1.0, 2.0, float("nan")], [0.0, 0.0, 0.0])
     assert (difference["known"], difference["of"]) == (2, 3)
+
+
+@pytest.mark.parametrize(
+    ("values", "cell"),
+    [
+        ([28.17], "28.17"),
+        ([28.17, float("nan")], "28.17 (1 of 2)"),
+        ([float("nan")], "no clips (0 of 1)"),
+        ([20.0, 22.0], "21.00 ± 1.41"),
+    ],
+)
+def test_a_cell_has_a_spread_only_of_several_clips(values, cell):
+    summary = summarize([{"psnr": value} for value in values], ["psnr"])["psnr"]
+    assert cell_of(summary, "{:.2f}") == cell
+
+
+def test_a_cell_of_an_undefined_value_is_no_number():
+    assert cell_of({"mean": float("nan"), "low": -1.0, "high": 1.0}, "{:.2f}") == "undefined"
+    assert cell_of(paired_difference([1.0, 2.5], [0.0, 0.0]), "{:.1f}") == "1.8 [-7.8, 11.3]"
+    assert cell_of(paired_difference([2.5], [0.0]), "{:.1f}") == "2.5"
+    assert cell_of(paired_difference([np.nan], [0.0]), "{:.1f}") == "no clips (0 of 1)"

@@ -113,3 +113,17 @@ def test_a_path_without_a_first_pose_has_no_errors():
     found = path()
     found[0] = np.nan
     assert np.isnan(path_errors(found, path())).all()
+
+
+def test_a_path_of_its_first_pose_alone_has_no_errors():
+    found = path()
+    found[1:] = np.nan
+    assert np.isnan(path_errors(found, path())).all()
+
+
+def test_jitter_of_a_camera_is_no_path():
+    jitter = np.tile(np.eye(4), (5, 1, 1))
+    jitter[1:, :3, 3] = 1e-6 * np.random.default_rng(0).normal(size=(4, 3))
+    still = np.tile(np.eye(4), (5, 1, 1))
+    assert path_errors(jitter, still).translation < 1e-5
+    assert path_errors(jitter, jitter[[0, 2, 1, 4, 3]]).translation < 1e-5

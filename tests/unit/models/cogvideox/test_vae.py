@@ -1,5 +1,7 @@
 """CogVideoX's VAE: standardized latents. Its numerics are compared in tests/parity."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,20 @@ from flax import nnx
 
 from egosim_jax.train.tasks.autoencoding import latent_statistics
 from tests.parity.cogvideox_configs.dwm_tiny import CONFIG as TINY
+
+
+@pytest.mark.parametrize("first", [1, 3])
+def test_latents_are_decoded_in_chunks_of_the_first_and_then_two(first):
+    config = replace(TINY.vae, decode_first=first)
+    vae = config.build(rngs=nnx.Rngs(0))
+    latents = jax.random.normal(jax.random.key(1), (1, 7, 2, 2, config.z_dim))
+    parts, cache = [], None
+    for start, stop in [(0, first), *((k, k + 2) for k in range(first, 7, 2))]:
+        part, cache = vae.decoder(latents[:, start:stop], cache)
+        parts.append(part)
+    expected = jnp.concatenate(parts, axis=1)
+    assert expected.shape[1] == 25
+    np.testing.assert_allclose(vae.decode_whole(latents), expected, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.slow

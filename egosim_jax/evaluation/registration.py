@@ -1,0 +1,245 @@
+"""Find the crop of the recorded video that a method's images show.
+
+Models of other sizes are often run on center crops. A crop is found by its correlation with the
+ground truth, jointly over clips, in three steps: a search over offsets and scales of small images
+at equal times; the recorded frame that is most similar to each frame of the method, since cameras
+and hands of generated clips may lead or lag; and the maximum of
+
+    sum over clips of -log(1 - r^2)
+
+with Pearson's r of the gray levels: the log-likelihood of one crop under noise, brightness and
+contrast of unknown size in each clip. A clip that the method got wrong thus has little weight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+MIN_CORRELATION = 0.7
+"""Minimum median correlation over clips of a crop that counts as found."""
+MAX_SLACK_PX = 1.5
+"""Maximum distance in recorded pixels of all edges from the whole image's that counts as whole."""
+MIN_GAIN = 0.1
+"""Minimum mean gain over clips of -log(1 - r^2) for a crop to replace the whole image."""
+FRAMES, TRUE_FRAMES = 6, 24
+"""Number of a method's frames, and of recorded frames, that are used of each clip."""
+_COARSE_PX, _FINE_PX, _EVERY = 96, 320, 4
+"""Widths of the images in both searches, and the step of frames in the first."""
+_MIN_SHARE = 0.3
+"""Minimum width of a crop in the search, as a share of the recorded width."""
+
+
+class Crop(NamedTuple):
+    """Part of an image, as edges in shares of its width and height."""
+
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+    def common(self, other: Crop) -> Crop:
+        """Return the intersection; it may be empty."""
+        return Crop(*map(max, self[:2], other[:2]), *map(min, self[2:], other[2:]))
+
+    def pixels(self, height: int, width: int) -> Crop:
+        """Return the edges in pixels of an image."""
+        return Crop(*np.multiply(self, (width, height) * 2).tolist())
+
+    def whole_pixels(self, height: int, width: int) -> Crop:
+        """Return the largest crop inside that has whole pixels of an image."""
+        edges = np.round(self.pixels(height, width), 2)
+        inside = np.concatenate([np.ceil(edges[:2]), np.floor(edges[2:])])
+        return Crop(*(inside / ((width, height) * 2)).tolist())
+
+    def within(self, other: Crop) -> Crop:
+        """Return this crop in shares of the crop `other`."""
+        left, top, right, bottom = other
+        size = np.array([right - left, bottom - top] * 2)
+        return Crop(*((np.array(self) - [left, top, left, top]) / size).tolist())
+
+
+WHOLE = Crop(0.0, 0.0, 1.0, 1.0)
+"""The whole image."""
+
+
+class Found(NamedTuple):
+    """A crop and its evidence."""
+
+    crop: Crop
+    """The whole image if no other crop was found."""
+    correlation: float
+    """Median correlation of the crop over clips."""
+    found: bool
+    """False if the images correlate too little with the recorded ones to find a crop."""
+
+
+Pair = tuple[UInt8[np.ndarray, "f h w 3"], UInt8[np.ndarray, "g i j 3"]]
+"""`FRAMES` frames of a method's clip and `TRUE_FRAMES` of its ground truth, over equal times."""
+
+
+def find_crop(pairs: Sequence[Pair]) -> Found:
+    """Return the crop that all clips of a method share.
+
+    All clips have one size, and so have their ground truths.
+    """
+    height, width = pairs[0][1].shape[1:3]
+    whole = WHOLE.pixels(height, width)
+    guess = _search(pairs)
+    couples = [_matched(pair, (whole, guess)) for pair in pairs]
+    start = max((whole, guess), key=lambda crop: _evidence(crop, couples).sum())
+    crop = _refine(start, couples)
+    couples = [_matched(pair, (whole, crop)) for pair in pairs]  # better ones, in a better crop
+    crop = _refine(crop, couples)
+    gain = _evidence(crop, couples) - _evidence(whole, couples)
+    slack = np.abs(np.subtract(crop, whole)).max()
+    if slack <= MAX_SLACK_PX or gain.mean() < MIN_GAIN or np.median(gain) <= 0:
+        crop = whole
+    correlation = float(np.sqrt(1 - np.exp(-np.median(_evidence(crop, couples)))))
+    found = correlation >= MIN_CORRELATION
+    shares = Crop(*np.divide(crop, (width, height) * 2).tolist())
+    return Found(shares if found and crop is not whole else WHOLE, correlation, found)
+
+
+def _search(pairs: Sequence[Pair]) -> Crop:
+    """Return the best crop among offsets and scales of small images at equal times."""
+    import cv2
+
+    (rows, columns), (height, width) = pairs[0][0].shape[1:3], pairs[0][1].shape[1:3]
+    small = _COARSE_PX / width
+    wide, high = _COARSE_PX, max(round(height * small), 1)
+    couples = [
+        (_gray(one), _resized(_gray(true[place]), high, wide))
+        for video, true in pairs
+        for one, place in [*zip(video, places(len(video), len(true)), strict=True)][::_EVERY]
+    ]
+    square = rows * wide / (columns * high)  # height of a crop by its width, as shares
+    best, found = -np.inf, WHOLE.pixels(height, width)
+    for share in np.geomspace(_MIN_SHARE, 1.1 * max(1.0, 1 / square), 28):
+        for ratio in [*np.linspace(0.92, 1.08, 5) * square, 0.97, 1.0, 1.03]:
+            size = round(share * wide), round(share * ratio * high)
+            if min(size) < 16 or share * ratio > 1.1 * max(1.0, square):
+                continue
+            margin = [max(edge - whole, 0) + edge // 10 for edge, whole in
+                      zip(size, (wide, high), strict=True)]  # fmt: skip
+            total = 0.0
+            for one, true in couples:
+                border = (margin[1], margin[1], margin[0], margin[0])
+                around = cv2.copyMakeBorder(true, *border, cv2.BORDER_CONSTANT, value=0)
+                template = _resized(one, size[1], size[0])
+                total += cv2.matchTemplate(around, template, cv2.TM_CCOEFF_NORMED)
+            top, left = np.unravel_index(np.argmax(total), np.shape(total))
+            if (value := np.max(total)) > best:
+                best = value
+                left, top = int(left) - margin[0], int(top) - margin[1]
+                found = Crop(left / small, top / small, (left + size[0]) / small,
+                             (top + size[1]) / small)  # fmt: skip
+    return found
+
+
+class _Couple(NamedTuple):
+    """Gray image of a method and the recorded one, as large as the fine search needs."""
+
+    image: Float[np.ndarray, "h w"]
+    true: Float[np.ndarray, "i j"]
+    scale: tuple[float, float]
+    """Pixels of `true` by recorded pixels, along columns and rows."""
+
+
+def _matched(pair: Pair, crops: Sequence[Crop]) -> _Couple:
+    """Return the frame of a method, and the recorded frame, that are most similar in a crop."""
+    video, true = pair
+    height, width = true.shape[1:3]
+    wide = min(_FINE_PX, width)
+    high = round(height * wide / width)
+    trues = [_resized(_gray(frame), high, wide) for frame in true]
+    scale = (wide / width, high / height)
+    best, found = -1.0, None
+    for frame in video:
+        gray = _gray(frame)
+        for crop in crops:
+            across, down = (crop.right - crop.left) * scale[0], (crop.bottom - crop.top) * scale[1]
+            image = _resized(gray, max(round(down), 16), max(round(across), 16))
+            for other in trues:
+                couple = _Couple(image, other, scale)
+                if (value := _correlation(crop, couple)) > best:
+                    best, found = value, couple
+    if found is None:
+        return _Couple(_resized(_gray(video[0]), high, wide), trues[0], scale)
+    return found
+
+
+def _evidence(crop: Crop, couples: Sequence[_Couple]) -> Float[np.ndarray, " n"]:
+    """Return -log(1 - r^2) of each clip; an equal image counts as r = 0.9999."""
+    r = np.array([_correlation(crop, couple) for couple in couples])
+    return -np.log(1 - np.clip(r, 0, 0.9999) ** 2)
+
+
+def _correlation(crop: Crop, couple: _Couple) -> float:
+    """Return the correlation of an image with the crop it may show, inside the recorded image."""
+    import cv2
+
+    image, true, (x, y) = couple
+    rows, columns = image.shape
+    across, down = (crop.right - crop.left) * x / columns, (crop.bottom - crop.top) * y / rows
+    left, top = crop.left * x + (across - 1) / 2, crop.top * y + (down - 1) / 2
+    if across <= 0 or down <= 0:
+        return 0.0
+    matrix = np.array([[across, 0, left], [0, down, top]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    seen = cv2.warpAffine(
+        true, matrix, (columns, rows), flags=flags, borderMode=cv2.BORDER_REPLICATE
+    )
+    first, last = (
+        np.ceil([-left / across - 1e-6, -top / down - 1e-6]),
+        np.floor(
+            [(true.shape[1] - 1 - left) / across + 1e-6, (true.shape[0] - 1 - top) / down + 1e-6]
+        ),
+    )
+    inside = (
+        slice(max(int(first[1]), 0), max(int(last[1]) + 1, 0)),
+        slice(max(int(first[0]), 0), max(int(last[0]) + 1, 0)),
+    )
+    a, b = image[inside], seen[inside]
+    if a.size < image.size // 4:
+        return 0.0
+    a, b = a - a.mean(), b - b.mean()
+    strength = float((a * a).sum() * (b * b).sum())
+    return float((a * b).sum()) / strength**0.5 if strength > 1e-6 else 0.0
+
+
+def _refine(start: Crop, couples: Sequence[_Couple]) -> Crop:
+    """Return the crop in pixels that has the most evidence near a first guess."""
+    from scipy.optimize import minimize
+
+    size = np.array([start.right - start.left, start.bottom - start.top] * 2)
+    origin, steps = np.array(start), 0.02 * size
+
+    def cost(x: np.ndarray) -> float:
+        return -float(_evidence(Crop(*(origin + x * steps)), couples).sum())
+
+    simplex = np.vstack([np.zeros(4), np.eye(4)])
+    for _ in range(2):  # restarted once, since a simplex may collapse
+        options = {"initial_simplex": simplex, "xatol": 2e-3, "fatol": 1e-5, "maxfev": 400}
+        found = minimize(cost, simplex[0], method="Nelder-Mead", options=options).x
+        simplex = np.vstack([found, found + 0.3 * np.eye(4)])
+    return Crop(*(origin + simplex[0] * steps).tolist())
+
+
+def places(count: int, of: int) -> list[int]:
+    """Return `count` evenly spaced places of `of`, some repeated if there are fewer."""
+    return np.rint(np.linspace(0, of - 1, count)).astype(int).tolist()
+
+
+def _gray(frame: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
+    return frame.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
+
+
+def _resized(image: Float[np.ndarray, "h w"], height: int, width: int) -> np.ndarray:
+    import cv2
+
+    how = cv2.INTER_AREA if height * width < image.size else cv2.INTER_LINEAR
+    return cv2.resize(image, (width, height), interpolation=how)
