@@ -169,7 +169,7 @@ class Stage:
         sheets = sorted(self.folder.glob("samples/step_*.png"))
         if not sheets:
             return
-        yield "<h3>Sample clips: generated and ground truth</h3>"
+        yield "<h3>Sample clips: generated and VAE reconstruction</h3>"
         clip = sheets[-1].with_suffix(".mp4")
         if clip.exists() and clip.stat().st_size <= MAX_CLIP_BYTES:
             video = _data("video/mp4", read_bytes(clip, limit=MAX_CLIP_BYTES))
