@@ -11,10 +11,9 @@ from typing import Any
 
 from egosim_jax.configs.model import ModelConfig
 from egosim_jax.data.manifest import MANIFEST
-from egosim_jax.data.records import RecordError
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.data.transforms import decode_record, video_shape
-from egosim_jax.io.bounded import read_json
+from egosim_jax.io.bounded import named, read_json
 from egosim_jax.io.decoding import Decoding
 from egosim_jax.io.run import write_json
 from egosim_jax.types import InputError, Triplet
@@ -98,10 +97,8 @@ def _example(
         arrays: dict[str, Any] = decode_record(
             record.arrays, config.video, start=start, decoding=decoding
         )
-    except RecordError as error:
-        return Damaged(window, str(error))
     except InputError as error:
-        return Damaged(window, f"{source.name(number)}: {error}")
+        return Damaged(window, named(source.name(number), error))
     metadata = record.metadata
     names = {name: str(metadata.get(name, "")) for name in ("video_id", "prompt")}
     return window, metadata, Triplet(**names, **arrays)

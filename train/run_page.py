@@ -192,7 +192,7 @@ class Stage:
         sheets = sorted(sheet for name in names if (sheet := own_file(self.folder, name)))
         if not sheets:
             return
-        yield "<h3>Sample clips: generated and ground truth</h3>"
+        yield "<h3>Sample clips: generated and VAE reconstruction</h3>"
         clip = own_file(self.folder, f"samples/{sheets[-1].stem}.mp4")
         if clip and clip.stat().st_size <= MAX_CLIP_BYTES:
             video = _data("video/mp4", read_bytes(clip, limit=MAX_CLIP_BYTES))

@@ -11,7 +11,7 @@ from array_record.python.array_record_module import ArrayRecordReader
 from egosim_jax.data.clip_files import is_safe_id
 from egosim_jax.data.manifest import ArrayInfo, Manifest, ShardInfo, file_problems, read_manifest
 from egosim_jax.data.records import Record, RecordError, from_bytes
-from egosim_jax.io.bounded import quote
+from egosim_jax.io.bounded import named, quote
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.images import decode_image
 from egosim_jax.io.video import decode_video
@@ -46,7 +46,7 @@ def _shard_problems(folder: Path, shard: ShardInfo, manifest: Manifest) -> list[
             problems += [f"{name}: {line}" for line in _read_problems(reader, index, manifest)]
         reader.close()
     except RuntimeError as error:
-        problems.append(f"{path}: {error}")
+        problems.append(named(str(path), error))
     return problems
 
 

@@ -32,7 +32,7 @@ from absl import flags
 from egosim_jax.data.manifest import Manifest
 from egosim_jax.data.mixing import Mixture
 from egosim_jax.data.shards import ShardReader
-from egosim_jax.io.bounded import listing
+from egosim_jax.io.bounded import listing, named
 from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import InputError
 
@@ -238,7 +238,7 @@ class _Read(grain.transforms.RandomMap):
             _check(arrays, self.source.manifest)
             example = self._transformed(arrays, rng)
         except InputError as error:
-            return _Bad(f"{self.source.name(element)}: {error}")
+            return _Bad(named(self.source.name(element), error))
         return {**example, "record": np.int32(element)}
 
     def _transformed(self, arrays: Example, rng: np.random.Generator) -> Any:

@@ -229,6 +229,12 @@ def own_file(folder: Path, name: str) -> Path | None:
     return None
 
 
+def named(name: str, error: BaseException) -> str:
+    """Return an error's message with the name of its file, once."""
+    text = str(error)
+    return text if text.startswith(name) else f"{name}: {text}"
+
+
 def listing(items: Sequence[str], *, limit: int = 5) -> str:
     """Join findings on one line: the first `limit`, and the number of further ones."""
     more = f"; and {len(items) - limit:,} more" if len(items) > limit else ""

@@ -92,21 +92,13 @@ def main(
     logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax raises its errors too
 
     def run() -> int:
-        import tyro
-
         if given == ["--version"]:
             print(f"{program} {metadata.version('egosim-jax')}")
             return ExitCode.DONE
         if (mistake := _mistyped(commands, given, program, others)) is not None:
             raise InputError(mistake)
-        command: Command = tyro.cli(
-            commands,
-            prog=program,
-            description=f"{description} --version prints the version.",
-            args=given,
-            config=(tyro.conf.OmitSubcommandPrefixes,),
-            registry=_rules(given),
-        )
+        about = f"{description} --version prints the version."
+        command = _parse(commands, given, program, about)
         _refuse_empty(command)
         with context():
             code = command.run()
@@ -126,6 +118,53 @@ def _refuse_empty(command: Any) -> None:
         elif value == () and field.default != () and field.default_factory is MISSING:
             name = field.name.replace("_", "-")
             raise InputError(f"--{name} has no value: give one or more, or omit it. (--{name})")
+
+
+def _parse(commands: Any, args: Sequence[str], program: str, about: str) -> Command:
+    """Return the command of a command line.
+
+    An error is printed by a parser of the chosen subcommand alone, because tyro suggests options
+    of all subcommands that it knows.
+    """
+    import tyro
+
+    def parse(kind: Any, args: Sequence[str], **options: Any) -> Any:
+        return tyro.cli(
+            kind,
+            args=args,
+            config=(tyro.conf.OmitSubcommandPrefixes,),
+            registry=_rules(args),
+            **options,
+        )
+
+    whole = {"prog": program, "description": about}
+    if {"-h", "--help"} & {*args} or any(arg.startswith("--tyro-") for arg in args):
+        return parse(commands, args, **whole)
+    try:
+        return parse(commands, args, **whole, console_outputs=False)
+    except SystemExit:
+        if (chosen := _chosen(commands, args)) is not None:
+            kind, depth = chosen
+            parse(
+                kind.__origin__,
+                args[depth:],
+                prog=" ".join([program, *args[:depth]]),
+                default=kind.__metadata__[0].default,
+            )
+        return parse(commands, args, **whole)
+
+
+def _chosen(commands: Any, args: Sequence[str]) -> tuple[Any, int] | None:
+    """Return the innermost subcommand that the first arguments name, and their number."""
+    for depth, name in enumerate(args, start=1):
+        known = {part.__metadata__[0].name: part for part in get_args(commands)}
+        if name not in known:
+            return None
+        kind = known[name]
+        commands = get_type_hints(kind.__origin__, include_extras=True).get("command")
+        if commands is None:
+            return kind, depth
+    return None
 
 
 def _rules(args: Sequence[str]) -> ConstructorRegistry:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from egosim_jax.geometry import invert, pixels_of, transform
 from egosim_jax.io.atomic import atomic_write
-from egosim_jax.io.bounded import quote, read_json
+from egosim_jax.io.bounded import named, quote, read_json
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.state.depth import DEPTH_M
 from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, SceneState
@@ -257,7 +257,7 @@ def read_action(path: Path, *, height: int, width: int, prompt: str | None) -> A
             prompt=prompt,
         )
     except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+        raise InputError(named(str(path), error)) from error
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -17,7 +17,14 @@ from typing import Any
 import numpy as np
 
 from egosim_jax.io.atomic import atomic_folder, check_replaceable
-from egosim_jax.io.bounded import check_version, quote, quote_path, quote_text, read_json
+from egosim_jax.io.bounded import (
+    check_version,
+    named,
+    quote,
+    quote_path,
+    quote_text,
+    read_json,
+)
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.state.ply import read_points, write_points
@@ -201,7 +208,7 @@ def read_ply(path: Path, template: SceneState | None = None) -> SceneState:
             return replace(template, **arrays)
         return SceneState(**arrays, intrinsics_px=np.eye(3), provenance={"read from": path.name})
     except InputError as error:
-        raise InputError(f"{quote_path(path)}: {error}") from error
+        raise InputError(named(quote_path(path), error)) from error
 
 
 def _levels(values: np.ndarray) -> np.ndarray:

@@ -69,7 +69,10 @@ def test_errors_of_lost_connections_are_told_from_others():
 @pytest.mark.parametrize("victim", ["first", "second", "second's child"])
 def test_the_other_of_two_processes_ends_with_one_line(tmp_path, victim):
     data = write_points(tmp_path / "data")
-    address, settings = free_local_address(), json.dumps({"steps": 10**6, "pause": 0.01, "save_every": 10**6})
+    address, settings = (
+        free_local_address(),
+        json.dumps({"steps": 10**6, "pause": 0.01, "save_every": 10**6}),
+    )
     command = [sys.executable, "-m", "tests.training.line", str(tmp_path / "out"), str(data)]
     processes = []
     for index in range(2):

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from egosim_jax.annotate.clip import Job, annotate
-from egosim_jax.annotate.prepare import RefusedError
 from egosim_jax.annotate.scene import to_triplet
 from egosim_jax.annotate.sources import Source, open_source
 from egosim_jax.annotate.stages import drop_flashes, hold_hands, visible
@@ -91,13 +90,11 @@ def test_a_clip_without_depth_is_refused_with_a_reason(tmp_path, known, state, m
     settings = config(state=state)
     parts = replace(settings.build(), depth=NoDepth(None, known))
     monkeypatch.setattr(type(settings), "build", lambda self: parts)
-    try:
-        record = stages_of(tmp_path, settings)
-    except (InputError, RefusedError) as error:
-        assert known == 0
-        assert "depth" in str(error)
-    else:
-        assert len(record.require("state").points_m) == 1
+    if not known:
+        with pytest.raises(InputError, match="depth"):
+            stages_of(tmp_path, settings)
+        return
+    assert len(stages_of(tmp_path, settings).require("state").points_m) >= 1
 
 
 class Blind(PaintedHands):
@@ -124,7 +121,8 @@ def test_networks_that_find_nothing_give_tracks_without_hands(frames, networks):
     tracks = LandmarkHands(networks=networks)(video)
     assert tracks.joints_px.shape == (frames, 2, 21, 2)
     assert not visible(tracks).any()
-    assert not (tracks.presence.any() or tracks.filled.any() or tracks.mirrored.any())
+    for values in (tracks.presence, tracks.filled, tracks.mirrored):
+        assert not values.any()
 
 
 @pytest.mark.parametrize("shown", [0, 1, 4])

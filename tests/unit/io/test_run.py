@@ -95,6 +95,23 @@ def test_a_mutable_field_may_change_and_is_recorded(tmp_path):
     assert "mesh.fsdp" not in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    ("recorded", "wanted", "message"),
+    [
+        (["cup", "dish"], ["cup", "bowl"], r"names\.1: the folder has 'dish', this run has 'bowl'"),
+        ([1, 2], [1], r"names: the folder has \[1, 2\], this run has \[1\]"),
+        ([], ["cup"], r'names: the folder has \[\], this run has \["cup"\]'),
+        ([{"seed": 1}], [{"seed": 2}], r"names\.0\.seed: the folder has 1, this run has 2"),
+        ({"a": 1}, [1], r'names: the folder has {"a": 1}, this run has \[1\]'),
+    ],
+    ids=["item", "shorter", "empty", "nested", "kinds"],
+)
+def test_different_lists_are_shown_by_their_difference(tmp_path, recorded, wanted, message):
+    open_folder(tmp_path, {"names": recorded})
+    with pytest.raises(InputError, match=message):
+        open_folder(tmp_path, {"names": wanted})
+
+
 def test_output_folders_are_not_compared(tmp_path):
     open_folder(tmp_path, {"simulate": {"out": "runs/a", "seed": 0}})
     open_folder(tmp_path, {"simulate": {"out": str(tmp_path), "seed": 0}})
