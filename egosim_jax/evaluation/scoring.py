@@ -54,7 +54,7 @@ class Protocol:
     frame_0: bool = False
     """True to compare also frame 0, which is given to the model."""
     registered: Literal["all", "sizes"] = "sizes"
-    """Folders whose crop of the recorded image is searched: all; or those of another image size.
+    """Folders whose crop of the recorded image is searched: all, or folders of another image size.
 
     All are also scored in their own crops."""
 
