@@ -49,7 +49,7 @@ KINDS = {
     "center 16:10 with margins": ((20.5, 8, 139.5, 88), (96, 60)),
     "off center": ((10, 20, 110, 90), (100, 70)),
     "zoomed at the full size": ((24, 14.4, 136, 81.6), (160, 96)),
-    "squeezed by two percent": ((1.5, 0, 158.5, 96), (160, 96)),
+    "squeezed by four percent": ((3, 0, 157, 96), (160, 96)),
     "whole, stretched to a square": ((0, 0, 160, 96), (64, 64)),
     "whole, letterboxed": ((0, -32, 160, 128), (64, 64)),
 }
