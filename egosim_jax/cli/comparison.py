@@ -137,10 +137,11 @@ class Options:
     ) -> Evaluation:
         """Compare the clips, print the table and write its files to a folder."""
         from egosim_jax.evaluation import pages
+        from egosim_jax.evaluation.cache import CACHE, ScoreCache
         from egosim_jax.evaluation.files import draw, write_files
         from egosim_jax.evaluation.metrics.dreamsim import MISSING
         from egosim_jax.evaluation.result import Evaluation
-        from egosim_jax.evaluation.scoring import CACHE, ScoreCache, Scoring
+        from egosim_jax.evaluation.scoring import Scoring
 
         if self.page_clips < 0:
             raise InputError(

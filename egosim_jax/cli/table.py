@@ -29,8 +29,9 @@ Name = Literal[
 class TableCommand(Options):
     """Make a table of the EgoSim or DWM paper from folders of clips of any model.
 
-    Clips are grouped by a metadata column (dataset) and compared by the paper's definitions. The
-    paper's own figures are separate rows. Prints the tables with spreads and paired differences.
+    Clips are grouped by a metadata column (dataset) and compared by the paper's definitions, inside
+    the crop of the recorded image that all folders show. The paper's own figures are separate rows.
+    Prints the tables with spreads and paired differences.
     Writes report.json, metrics.jsonl, scores.csv (one row per clip), table.tex, scores.png and
     index.html with the clips in columns. Scores are cached by content: a repeated command computes
     only new ones.

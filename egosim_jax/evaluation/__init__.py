@@ -11,7 +11,8 @@ here.
     measures     columns of a table: pixels, LPIPS, DreamSim
     estimated    columns that need estimates: regions, depth, cameras, hands
     fvd          Fréchet video distance
-    scoring      Protocol, Scoring: score methods on clips, with a cache
+    scoring      Protocol, Scoring: score methods on clips
+    registration, crops, cache   crops that images show; scores by content
     result       Evaluation: summaries, paired differences, report
     tables       the papers' tables
     files        report.json, metrics.jsonl, scores.csv, table.tex, scores.png
@@ -26,11 +27,12 @@ from pathlib import Path
 from typing import Literal
 
 from egosim_jax.data.clip_files import ClipFiles
+from egosim_jax.evaluation.cache import CACHE, ScoreCache
 from egosim_jax.evaluation.files import write_files
 from egosim_jax.evaluation.measures import standard
 from egosim_jax.evaluation.methods import BASELINES, Folder, autoencoded
 from egosim_jax.evaluation.result import Evaluation
-from egosim_jax.evaluation.scoring import CACHE, Protocol, ScoreCache, Scoring
+from egosim_jax.evaluation.scoring import Protocol, Scoring
 
 __all__ = ["Evaluation", "Protocol", "Scoring", "evaluate"]
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from egosim_jax.data.windows import Window
+from egosim_jax.evaluation.cache import ScoreCache
 from egosim_jax.evaluation.measures import VERSION
 from egosim_jax.evaluation.methods import Folder, without_border
 from egosim_jax.evaluation.registration import (
@@ -24,9 +24,6 @@ from egosim_jax.evaluation.registration import (
 )
 from egosim_jax.io.digest import fingerprint, sha256
 from egosim_jax.io.video import VideoInfo, probe_video, read_video
-
-if TYPE_CHECKING:
-    from egosim_jax.evaluation.scoring import ScoreCache
 
 CLIPS, MAX_FRAMES = 8, 64
 """Maximum number of clips from which a crop is found, and of the frames read of each."""

@@ -21,6 +21,8 @@ from jaxtyping import Float, UInt8
 
 MIN_CORRELATION = 0.7
 """Minimum median correlation over clips of a crop that counts as found."""
+SNAP_PX = 1.0
+"""Maximum distance in recorded pixels of an edge from the image's that counts as equal."""
 MAX_SLACK_PX = 1.5
 """Maximum distance in recorded pixels of all edges from the whole image's that counts as whole."""
 MIN_GAIN = 0.1
@@ -94,6 +96,8 @@ def find_crop(pairs: Sequence[Pair]) -> Found:
     crop = _refine(start, couples)
     couples = [_matched(pair, (whole, crop)) for pair in pairs]  # better ones, in a better crop
     crop = _refine(crop, couples)
+    near = np.abs(np.subtract(crop, whole)) <= SNAP_PX
+    crop = Crop(*np.where(near, whole, crop).tolist())
     gain = _evidence(crop, couples) - _evidence(whole, couples)
     slack = np.abs(np.subtract(crop, whole)).max()
     if slack <= MAX_SLACK_PX or gain.mean() < MIN_GAIN or np.median(gain) <= 0:

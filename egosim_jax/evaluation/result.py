@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from egosim_jax.evaluation.cache import Scores
 from egosim_jax.evaluation.fvd import distance_of, is_feature
 from egosim_jax.evaluation.measures import Column, columns_of
 from egosim_jax.evaluation.methods import FIT
@@ -16,7 +17,7 @@ from egosim_jax.evaluation.metrics.report import (
     print_table,
     summarize,
 )
-from egosim_jax.evaluation.scoring import OWN, Protocol, Row, Scores, Scoring, row_of
+from egosim_jax.evaluation.scoring import OWN, Protocol, Row, Scoring, row_of
 
 KNOWN = {
     "depth_err": Column("Depth ERR of the paper", "{:.3f}", "lower"),

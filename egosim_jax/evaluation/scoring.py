@@ -19,13 +19,12 @@ import numpy as np
 
 from egosim_jax.data.clip_files import ClipFiles
 from egosim_jax.data.windows import Window, read_results
+from egosim_jax.evaluation.cache import ScoreCache, Scores
 from egosim_jax.evaluation.crops import find_crops
 from egosim_jax.evaluation.fvd import is_feature
 from egosim_jax.evaluation.measures import VERSION, GroundTruth, Measure, Scorer
 from egosim_jax.evaluation.methods import FIT, Folder, Method, Shape, read_at
 from egosim_jax.evaluation.registration import WHOLE, Crop
-from egosim_jax.io.atomic import append_line
-from egosim_jax.io.bounded import read_lines
 from egosim_jax.io.digest import fingerprint, sha256
 from egosim_jax.io.video import VideoInfo, probe_video
 from egosim_jax.runtime.progress import track
@@ -35,12 +34,8 @@ MAX_RATE_ERROR = 0.01
 """Maximum relative difference of two frame rates that count as one, such as 29.97 and 30."""
 MIN_COMPARED_PX = 16
 """Minimum height and width of the compared part of an image."""
-CACHE = "scores_cache.jsonl"
-"""Name of the cache file in the folder of a report."""
 OWN = "_own"
 """End of a row's name whose scores are in the method's own crop."""
-Scores = Mapping[str, float]
-"""Values of one clip by measure."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +49,7 @@ class Protocol:
     frame_0: bool = False
     """True to compare also frame 0, which is given to the model."""
     registered: Literal["all", "sizes"] = "sizes"
-    """Folders whose crop of the recorded image is searched: all; or those of another image size.
+    """Folders whose crop of the recorded image is searched: all, or folders of another image size.
 
     All are also scored in their own crops."""
 
@@ -95,35 +90,6 @@ class Row:
     scores: Scores
     own: bool = False
     """True for the scores in the method's own crop instead of the common one."""
-
-
-@dataclass(frozen=True)
-class ScoreCache:
-    """Scores by content hash, in a JSON Lines file."""
-
-    path: Path
-    """File to read and to append to."""
-
-    @cached_property
-    def _known(self) -> dict[str, dict[str, float]]:
-        if not self.path.is_file():
-            return {}
-        lines = [line for _, line in read_lines(self.path) if isinstance(line, dict)]
-        return {
-            line["key"]: {name: float("nan") if v is None else v for name, v in scores.items()}
-            for line in lines
-            if isinstance(line.get("key"), str) and isinstance(scores := line.get("scores"), dict)
-        }
-
-    def get(self, key: str) -> Scores | None:
-        """Return the scores of a key, or None if they are unknown."""
-        return self._known.get(key)
-
-    def put(self, key: str, scores: Scores) -> None:
-        """Add scores; they are on disk when this returns."""
-        self._known[key] = dict(scores)
-        plain = {name: None if np.isnan(value) else value for name, value in scores.items()}
-        append_line(self.path, {"key": key, "scores": plain})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -211,10 +211,15 @@ def summarize_runs(
     scenes = over_seeds(runs)
     seeds = summarize([_means(scores) for scores in runs], MEASURES)
     return {
-        name: {**summary, "spread_over_seeds": seeds[name].get("spread", np.nan)}
+        name: {**summary, **_over_seeds(seeds[name])}
         for name, summary in summarize(scenes, MEASURES).items()
     }
 
 
 def _means(scores: Sequence[Mapping[str, float]]) -> dict[str, float]:
     return {name: summary["mean"] for name, summary in summarize(scores, MEASURES).items()}
+
+
+def _over_seeds(summary: Mapping[str, float]) -> dict[str, float]:
+    """Return the spread of a summary as the spread over seeds; nothing for one seed."""
+    return {"spread_over_seeds": summary["spread"]} if "spread" in summary else {}

@@ -101,8 +101,7 @@ def camera_errors(
 ) -> tuple[float, float]:
     """Return the RMS errors of position in meters and of rotation in degrees.
 
-    Frames without a finite pose are ignored; their number belongs beside the errors. NaN if no pose
-    is finite.
+    Frames without a finite pose are ignored: report their number, too. NaN if no pose is finite.
     """
     known = np.isfinite(world_from_camera).all(axis=(1, 2))
     if not known.any():

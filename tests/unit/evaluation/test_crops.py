@@ -11,11 +11,18 @@ from PIL import Image
 
 from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.table import TableCommand
+from egosim_jax.evaluation.metrics import lpips
 from egosim_jax.evaluation.registration import WHOLE, Crop, find_crop
 from egosim_jax.io.video import write_video
 from egosim_jax.runtime.command import ExitCode
 
 HEIGHT, WIDTH = 96, 160
+
+
+@pytest.fixture(autouse=True)
+def without_lpips(monkeypatch):
+    """Compare by pixels alone: networks are slow in the tests' programs."""
+    monkeypatch.setattr(lpips, "load_if_installed", lambda name: None)
 
 
 def recorded(seed, frames=8):
@@ -49,7 +56,7 @@ KINDS = {
     "center 16:10 with margins": ((20.5, 8, 139.5, 88), (96, 60)),
     "off center": ((10, 20, 110, 90), (100, 70)),
     "zoomed at the full size": ((24, 14.4, 136, 81.6), (160, 96)),
-    "squeezed by two percent": ((1.5, 0, 158.5, 96), (160, 96)),
+    "squeezed by four percent": ((3, 0, 157, 96), (160, 96)),
     "whole, stretched to a square": ((0, 0, 160, 96), (64, 64)),
     "whole, letterboxed": ((0, -32, 160, 128), (64, 64)),
 }
@@ -139,7 +146,7 @@ def test_a_table_compares_inside_the_common_crop_and_in_own_crops(metadata, tmp_
         row = rows["clip1", method]
         assert int(row["width"]) == pytest.approx(78, abs=1)  # columns 32 to 110
         assert int(row["height"]) == pytest.approx(96, abs=1)
-    assert float(rows["clip1", "left"]["psnr"]) > 38  # stretched, it has 13
+    assert float(rows["clip1", "left"]["psnr"]) > 30  # stretched, it has 13
     assert float(rows["clip1", "square"]["psnr"]) > 25
     assert int(rows["clip1", "left_own"]["width"]) == pytest.approx(110, abs=1)
     assert int(rows["clip1", "wide_own"]["width"]) == 160

@@ -1,5 +1,7 @@
 """Batch generation, by networks without layers that show the hands."""
 
+from dataclasses import replace
+
 import pytest
 
 from egosim_jax.data.windows import read_results
@@ -51,6 +53,23 @@ def test_a_clip_without_the_wanted_reconstruction_is_not_finished(tmp_path):
     assert run(again, found)[0].done == 1
     assert (out / "a_vae.mp4").exists()
     assert run(again, found)[0].existing == 1
+
+
+@pytest.mark.parametrize("policy", ["strict", "lenient"])
+@pytest.mark.parametrize("truth", ["not in the metadata", "missing file"])
+def test_a_reconstruction_without_ground_truth_is_refused_before_work(tmp_path, policy, truth):
+    found = windows(tmp_path / "clips", a=40, b=120)
+    if truth == "missing file":
+        found[0].files.target.unlink()
+    else:
+        found[0] = replace(found[0], files=replace(found[0].files, target=None))
+    given = job(tmp_path / "out", reconstruct=True, policy=policy)
+    valid, rejected = given.check(found)
+    assert [window.output_id for window in valid] == ["b"]
+    assert "omit --reconstruct" in rejected[0][1]
+    outcome, statuses = run(given, found)
+    assert (outcome.done, outcome.rejected, statuses) == (1, 1, {"a": "failed", "b": "done"})
+    assert not job(tmp_path / "other", policy="lenient").check(found)[1]
 
 
 def test_one_clip_that_is_not_finite_does_not_cost_the_others_of_its_batch(tmp_path, monkeypatch):

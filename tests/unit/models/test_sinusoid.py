@@ -10,7 +10,7 @@ TIMES = [0.0, 1.0, 19.0, 333.0, 761.5, 980.0, 999.0]
 
 
 def in_float32(times, dim):
-    """Return cosines and sines of angles of which every step is rounded to float32."""
+    """Return cosines and sines of angles; every step of the angles is rounded to float32."""
     rows = []
     for time in times:
         angles = []
