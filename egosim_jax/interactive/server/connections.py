@@ -4,7 +4,8 @@ uvicorn reads a request however slowly it comes, and has no option against it. H
 that has no request under way is closed after `HEAD_S`, and one above the limit is refused before
 anything of it is read. The client of a websocket gets an error for a message above the limit before
 its connection is closed. This is the only module that knows the inside of uvicorn: it subclasses
-`H11Protocol` and `WebSocketsSansIOProtocol`, whose names `tests/unit/interactive/server/test_connections.py` checks.
+`H11Protocol` and `WebSocketsSansIOProtocol`. Their names are checked in
+`tests/unit/interactive/server/test_connections.py`.
 """
 
 from __future__ import annotations
