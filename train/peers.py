@@ -1,7 +1,7 @@
-"""End of a run of several processes of which one has died.
+"""End of a run of several processes after one of them has died.
 
 jax then aborts the other processes in C++, with a stack and signal 6. A supervisor that restarts on
-exit codes could not tell this from a defect. So each process of such a run is a child of one that
+exit codes would take this for a defect. So each process of such a run is a child of one that
 only waits: it replaces jax's report by one line and exit code 75, and passes on everything else.
 """
 

@@ -1,7 +1,7 @@
 """Statistics of a LeRobot dataset (meta/stats.json), as `lerobot` 0.4.4 computes them.
 
-Each episode has its own minimum, maximum, mean, standard deviation and quantiles. Those of the
-dataset are their means, weighted by the number of frames; the standard deviation is exact. Images
+Each episode has its own minimum, maximum, mean, standard deviation and quantiles. The dataset's
+quantiles are their means, weighted by the number of frames; the other statistics are exact. Images
 are sampled. Followed: `datasets/compute_stats.py`, which estimates the quantiles by histograms of
 5000 bins; ours are exact.
 """

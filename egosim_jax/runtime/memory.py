@@ -14,7 +14,7 @@ def return_freed_blocks() -> None:
     """Make this process return large freed blocks to the system; only glibc needs it.
 
     glibc raises the threshold to the largest freed block, up to 32 MiB. Blocks below it then stay
-    in the arena of their thread, of which a server has many.
+    in the arena of their thread, and a server has many threads.
     """
     if sys.platform == "linux":
         try:

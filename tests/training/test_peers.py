@@ -59,7 +59,7 @@ def test_sigterm_reaches_the_child_and_sigkill_ends_it():
             assert process.stdout.read() == ""  # the child, which has the other end, has ended
 
 
-def test_errors_of_lost_connections_are_told_from_others():
+def test_errors_of_lost_connections_differ_from_others():
     for text in ("Gloo all-reduce failed: Connection closed by peer", "NCCL error: unhandled"):
         assert is_peer_failure(RuntimeError(text))
     assert not is_peer_failure(RuntimeError("RESOURCE_EXHAUSTED: out of memory"))

@@ -2,9 +2,10 @@
 
 uvicorn reads a request however slowly it comes, and has no option against it. Here a connection
 that has no request under way is closed after `HEAD_S`, and one above the limit is refused before
-anything of it is read. A websocket message above the limit is answered before its connection is
-closed. This is the only module that knows the inside of uvicorn: it subclasses `H11Protocol` and
-`WebSocketsSansIOProtocol`, whose names `tests/unit/interactive/server/test_connections.py` checks.
+anything of it is read. The client of a websocket gets an error for a message above the limit before
+its connection is closed. This is the only module that knows the inside of uvicorn: it subclasses
+`H11Protocol` and `WebSocketsSansIOProtocol`. Their names are checked in
+`tests/unit/interactive/server/test_connections.py`.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class BoundedProtocol(H11Protocol):
 
 
 class BoundedWebsocket(WebSocketsSansIOProtocol):
-    """Websocket of uvicorn that answers a too large message before it closes."""
+    """Websocket of uvicorn that sends the error of a too large message before it closes."""
 
     def data_received(self, data: bytes) -> None:
         """Read data, or discard it after a message was refused."""
@@ -74,11 +75,11 @@ class BoundedWebsocket(WebSocketsSansIOProtocol):
         if not isinstance(self.conn.parser_exc, PayloadTooBig):
             super().handle_parser_exception()
             return
-        answer = Frame(Opcode.TEXT, json.dumps(too_large().body()).encode())
-        self.transport.write(answer.serialize(mask=False))
+        error = Frame(Opcode.TEXT, json.dumps(too_large().body()).encode())
+        self.transport.write(error.serialize(mask=False))
         self.transport.write(b"".join(self.conn.data_to_send()))
         self.close_sent = True
-        # closed with unread data, the connection is reset and the client never sees the answer
+        # closed with unread data, the connection is reset and the client never sees the error
         self.close_timer = self.loop.call_later(DISCARD_S, self.transport.close)
         self.queue.put_nowait({"type": "websocket.disconnect", "code": 1009})
 

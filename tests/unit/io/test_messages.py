@@ -22,14 +22,14 @@ def test_a_file_is_named_once(name, text, shown):
 @pytest.mark.parametrize(
     ("value", "limit", "shown"),
     [
-        (49.7, 50, "49.7"),
-        (49.97, 50, "49.97"),
-        (115.00004, 115, "115.00004"),
+        (49.7, 50.0, "49.7"),
+        (49.97, 50.0, "49.97"),
+        (115.00004, 115.0, "115.00004"),
         (79.6, 80.0, "79.6"),
-        (12.3456, 50, "12.3"),
-        (0.0, 1, "0"),
-        (float("nan"), 1, "nan"),
-        (50.0, 50, "50.0"),
+        (12.3456, 50.0, "12.3"),
+        (0.0, 1.0, "0"),
+        (float("nan"), 1.0, "nan"),
+        (50.0, 50.0, "50.0"),
     ],
 )
 def test_a_number_is_never_shown_as_the_limit_that_it_breaks(value, limit, shown):

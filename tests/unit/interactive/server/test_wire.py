@@ -55,7 +55,7 @@ def test_a_message_of_too_many_items_is_refused(item, monkeypatch):
 
 
 def pypi(value):
-    """What msgpack_numpy.encode 0.4.8 of PyPI returns for a value that msgpack does not know."""
+    """Return a value as msgpack_numpy.encode 0.4.8 of PyPI does, if msgpack does not know it."""
     if isinstance(value, np.ndarray):
         structured = value.dtype.kind in "VO"
         return {
