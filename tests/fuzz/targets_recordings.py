@@ -150,7 +150,7 @@ def other_hdf5(data: bytes, random: Random) -> bytes:
 
 def other_parquet(data: bytes, random: Random) -> bytes:
     """Write columns of other kinds and encodings, mostly of equal values."""
-    file, rows = io.BytesIO(), random.choice((0, 1, 1000, 1 << 20, 3 << 20))
+    file, rows = io.BytesIO(), random.choice((0, 1, 1000, 1 << 17, 1 << 20))
     text, index = "x" * random.choice((1, 100, 1 << 20)), np.zeros(rows, np.int8)
     kinds = (
         lambda: pa.DictionaryArray.from_arrays(index, [text]),
