@@ -125,8 +125,7 @@ SIZES = (0, 1, 3, 1 << 10, 1 << 18, 1 << 22, 1 << 40)
 def other_hdf5(data: bytes, random: Random) -> bytes:
     """Write datasets of other shapes, kinds, chunks and filters, mostly of fill values."""
     file = io.BytesIO()
-    refused = (ValueError, TypeError, OSError, AttributeError, KeyError, RuntimeError)
-    with h5py.File(file, "w") as written, contextlib.suppress(*refused):
+    with contextlib.suppress(Exception), h5py.File(file, "w") as written:
         for name, shape in (("camera/intrinsic", (3, 3)), ("transforms/camera", (3, 4, 4))):
             shape = random.choice((shape, (random.choice(SIZES), *shape[1:]), shape[1:]))
             options: dict[str, Any] = {"fillvalue": random.choice(FILLS)}
@@ -150,7 +149,7 @@ def other_hdf5(data: bytes, random: Random) -> bytes:
 
 def other_parquet(data: bytes, random: Random) -> bytes:
     """Write columns of other kinds and encodings, mostly of equal values."""
-    file, rows = io.BytesIO(), random.choice((0, 1, 1000, 1 << 20, 3 << 20))
+    file, rows = io.BytesIO(), random.choice((0, 1, 1000, 1 << 17, 1 << 20))
     text, index = "x" * random.choice((1, 100, 1 << 20)), np.zeros(rows, np.int8)
     kinds = (
         lambda: pa.DictionaryArray.from_arrays(index, [text]),

@@ -159,7 +159,7 @@ def _open(path: Path) -> Iterator[_Hdf5]:
                 yield _Hdf5(opened, name)
         except InputError:
             raise
-        except (OSError, KeyError, RuntimeError, ValueError, TypeError) as error:
+        except (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError) as error:
             raise InputError(
                 f"{name} is not a readable HDF5 file: {quote_text(str(error))}."
             ) from error

@@ -1,12 +1,16 @@
 """Requests refused before they are read, and bounds on connections."""
 
 import asyncio
+import base64
 import http.client as http_client
+import io
 import json
 import socket
+import tempfile
 import threading
 import urllib.error
 import urllib.request
+import zipfile
 
 import pytest
 import websockets.sync.client
@@ -139,3 +143,38 @@ def test_the_host_header_does_not_open_a_path():
     connection = OldConnection({"type": "http", "path": "/sessions", "headers": headers})
     with pytest.raises(RequestError, match="token"):
         Guard(FastAPI(), token=TOKEN)._check(connection)
+
+
+def test_the_sessions_that_are_kept_are_bounded(tmp_path):
+    service, port, _ = run(tmp_path, limits=Limits(kept=1))
+    for name in ("one", "two"):
+        assert http(port, "/sessions", {"session": name})[0] == 200
+    assert http(port, "/sessions/one?keep=true", method="DELETE")[0] == 200
+    status, body = http(port, "/sessions/two?keep=true", method="DELETE")
+    assert (status, json.loads(body)["code"]) == (429, "too_many_kept")
+    assert http(port, "/sessions/two", method="DELETE")[0] == 200
+    service.store.close()
+
+
+def test_repeated_names_and_large_documents_are_refused(server):
+    _, port = server
+    for body in (b'{"seed": 1, "seed": 2}', b'{"seed": ' + b"[" * 100_000 + b"}"):
+        connection = http_client.HTTPConnection("127.0.0.1", port, timeout=60)
+        connection.request("POST", "/sessions", body, {"Content-Type": "application/json"})
+        with connection.getresponse() as reply:
+            assert reply.status == 422
+        connection.close()
+    with pytest.raises(Exception, match="repeated"):
+        wire.unpack(b"\x82\xa1a\x01\xa1a\x02", limit=100)
+
+
+def test_an_episode_that_is_refused_says_nothing_of_the_servers_folders(server):
+    _, port = server
+    assert http(port, "/sessions", {"session": "told"})[0] == 200
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w") as archive:
+        archive.writestr("state/state.json", "{}")
+    episode = base64.b64encode(data.getvalue()).decode()
+    status, body = http(port, "/sessions/told/reset", {"episode": episode})
+    assert status == 422
+    assert tempfile.gettempdir() not in body.decode()
