@@ -1,4 +1,4 @@
-"""Images are read as viewers show them: turned by EXIF, in sRGB; what is not known is refused."""
+"""Images are read as viewers show them: turned by EXIF, in sRGB, or refused."""
 
 import io
 import struct
@@ -163,14 +163,14 @@ def adobe_rgb_of_a_camera():
     return encode(Image.fromarray(BLOCKS), "JPEG", exif=exif)
 
 
-PICTURE = Image.fromarray(BLOCKS)
+IMAGE = Image.fromarray(BLOCKS)
 REFUSED = {
     "rgba": (lambda: transparent("RGBA"), "transparent pixels.*-flatten"),
     "gray_alpha": (lambda: transparent("LA"), "transparent pixels.*-flatten"),
     "webp_alpha": (lambda: transparent("RGBA", "WEBP"), "transparent pixels.*-flatten"),
     "palette_alpha": (palette, "transparent pixels.*-flatten"),
-    "cmyk_jpeg": (lambda: encode(PICTURE.convert("CMYK"), "JPEG"), "CMYK.*-colorspace sRGB"),
-    "cmyk_tiff": (lambda: encode(PICTURE.convert("CMYK"), "TIFF"), "CMYK.*-colorspace sRGB"),
+    "cmyk_jpeg": (lambda: encode(IMAGE.convert("CMYK"), "JPEG"), "CMYK.*-colorspace sRGB"),
+    "cmyk_tiff": (lambda: encode(IMAGE.convert("CMYK"), "TIFF"), "CMYK.*-colorspace sRGB"),
     "linear_png": (lambda: chunk(b"gAMA", struct.pack(">I", 100_000)), "gamma is 1, not"),
     "wide_png": (
         lambda: chunk(
@@ -183,13 +183,13 @@ REFUSED = {
     "hlg_png": (lambda: chunk(b"cICP", bytes([9, 18, 0, 1])), r"HDR \(HLG\)"),
     "camera_adobe_rgb": (adobe_rgb_of_a_camera, "EXIF says Adobe RGB"),
     "broken_profile": (
-        lambda: encode(PICTURE, "JPEG", icc_profile=b"no profile" * 20),
+        lambda: encode(IMAGE, "JPEG", icc_profile=b"no profile" * 20),
         "profile that cannot be used",
     ),
-    "jpeg_aspect": (lambda: encode(PICTURE, "JPEG", dpi=(72, 144)), "not square.*-density"),
-    "png_aspect": (lambda: encode(PICTURE, "PNG", dpi=(100, 75)), "not square.*-density"),
-    "tiff_aspect": (lambda: encode(PICTURE, "TIFF", dpi=(204, 98)), "not square.*-density"),
-    "gif": (lambda: encode(PICTURE, "GIF"), "must be PNG or JPEG"),
+    "jpeg_aspect": (lambda: encode(IMAGE, "JPEG", dpi=(72, 144)), "not square.*-density"),
+    "png_aspect": (lambda: encode(IMAGE, "PNG", dpi=(100, 75)), "not square.*-density"),
+    "tiff_aspect": (lambda: encode(IMAGE, "TIFF", dpi=(204, 98)), "not square.*-density"),
+    "gif": (lambda: encode(IMAGE, "GIF"), "must be PNG or JPEG"),
     "heic": (lambda: b"\0\0\0\x18ftypheic" + bytes(40), "must be PNG or JPEG"),
 }
 
@@ -202,7 +202,7 @@ def test_colors_and_shapes_that_are_not_known_are_refused_with_a_fix(name):
 
 
 def test_the_shape_of_stored_pixels_is_of_their_camera():
-    data = encode(PICTURE, "PNG", dpi=(100, 75))
+    data = encode(IMAGE, "PNG", dpi=(100, 75))
     np.testing.assert_array_equal(decode_image(data, pixels="stored"), BLOCKS)
 
 
@@ -215,7 +215,7 @@ def test_labels_are_the_stored_numbers(mode):
         image.putpalette(list(range(255, -1, -1)) * 3)
     np.testing.assert_array_equal(decode_labels(encode(image, "PNG"), "labels"), numbers)
     with pytest.raises(InputError, match="one channel"):
-        decode_labels(encode(PICTURE, "PNG"), "labels")
+        decode_labels(encode(IMAGE, "PNG"), "labels")
 
 
 def test_depth_keeps_16_bits(tmp_path):

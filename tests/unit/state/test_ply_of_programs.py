@@ -1,4 +1,4 @@
-"""Point clouds as other programs write them: names of colors, splats, and what is refused."""
+"""Point clouds as other programs write them: names of colors, splats, and refusals."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What a source does not know is unknown in the recording, or the user is asked."""
+"""Unknown facts of a source are unknown in its recording, or the user is asked."""
 
 import h5py
 import numpy as np
