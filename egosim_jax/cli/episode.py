@@ -28,7 +28,7 @@ class MakeEpisode:
     world_from_camera (f, 4, 4), intrinsics_px (3, 3), joints_m (f, hands, 21 or 3, 3), null or NaN
     where a hand is missing. Intrinsics are in pixels of the clips: scale them with the video. A
     .json file may also have a prompt. Give the scene by --state, or by --image (without hands) and
-    --depth, both seen from the first camera.
+    --depth, both seen from the first camera. An image of another shape than the clips is cropped.
     """
 
     out: Path
@@ -48,7 +48,7 @@ class MakeEpisode:
     state: Path | None = None
     """Folder of a state, or a .ply of colored points."""
     image: Path | None = None
-    """RGB image of the scene without hands, from the first camera, at any resolution."""
+    """Image of the scene without hands, from the first camera, at any resolution."""
     depth: Path | None = None
     """Depth of the image in meters: an .npz file with the array depth_m."""
 

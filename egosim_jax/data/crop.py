@@ -1,4 +1,4 @@
-"""Fit images to another size: scale both axes alike, and crop what is too much, about the center.
+"""Fit images to another size: scale both axes alike, and crop the rest about the center.
 
 Intrinsics follow. A crop that loses more than 40 % of the image, such as landscape from portrait,
 is refused.

@@ -108,7 +108,7 @@ def _follow(names: Sequence[str]) -> list[bool]:
     """
     steps = list(map(_step, names, names[1:]))
     known = [step for step in steps if step is not None]
-    usual = float(np.median(known)) if known else 1.0
+    usual = float(np.percentile(known, 50, method="lower")) if known else 1.0
     return [step is None or usual / MAX_JUMP < step < usual * MAX_JUMP for step in steps]
 
 

@@ -223,7 +223,7 @@ def _read_lens(written: Mapping[str, Any], frames: list[dict[str, Any]], path: P
 
 
 def _pose(entry: Mapping[str, Any]) -> np.ndarray:
-    """Return the pose of a frame; an array of another shape if it is none."""
+    """Return the pose of a frame; an array of another shape if it has none."""
     try:
         matrix = np.array(entry.get("transform_matrix"), float)
     except (TypeError, ValueError):

@@ -80,6 +80,17 @@ def test_pack_of_bad_clips_alone_is_refused_and_leaves_nothing(clips, out):
     assert [path.name for path in out.iterdir()] == [LOCK]
 
 
+@pytest.mark.parametrize("gone", ["video.mp4", "pc_mask_video.mp4", "first_frame.png"])
+def test_pack_of_bad_clips_alone_prints_the_reason_of_each(clips, out, capsys, gone):
+    for name in ("clip0", "clip1"):
+        (clips.parent / name / gone).unlink()
+    with pytest.raises(InputError, match="None of the 2 clips"):
+        Pack(metadata=clips, out=out).run()
+    shown = capsys.readouterr().err
+    for name in ("clip0", "clip1"):
+        assert f"({name}): {clips.parent}/{name}/{gone} cannot be read" in shown
+
+
 def test_pack_refuses_to_replace_shards_unasked(clips, out):
     Pack(metadata=clips, out=out).run()
     with pytest.raises(InputError, match="--overwrite"):
