@@ -30,7 +30,11 @@ def write_film(path, stamps=EVEN, *, format="mp4", unit=TICK, codec="libx264", c
     with av.open(str(path), "w", format=format, options=muxing) as container:
         stream = container.add_stream(codec, rate=Fraction(rate))
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
-        quality = {"preset": "ultrafast", "crf": "8"} if codec == "libx264" else {"qmin": "1"}
+        quality = (
+            {"preset": "ultrafast", "crf": "8"}
+            if codec == "libx264"
+            else {"qmin": "1", "qmax": "2"}
+        )
         stream.options = {**quality, "bf": "0", "g": "8", **options}
         stream.codec_context.time_base = unit if codec == "libx264" else Fraction(1, rate)
         packets = []
@@ -57,16 +61,26 @@ def _repeat(path):
     write_film(path, [1300 if t == 1400 else t for t in EVEN], format="matroska")
 
 
+ALL = list(range(FRAMES))
 FILMS = {
-    "even": write_film,
-    "offset": lambda path: write_film(path, [t + 4500 for t in EVEN], format="matroska"),
-    "long last frame": lambda path: write_film(path, last=20 * PERIOD),
-    "missing frame": lambda path: write_film(path, [t for t in EVEN if t != 1000]),
-    "repeated stamp": _repeat,
-    "jitter": lambda path: write_film(path, [t + (-1) ** (t // PERIOD) * 12 for t in EVEN]),
-    "edit list": lambda path: write_film(path, [t - 5 * PERIOD for t in EVEN]),
-    "open group": lambda path: write_film(
-        path, codec="mpeg2video", format="mpegts", bf="2", g="9", cut=9
+    "even": (write_film, ALL),
+    "offset": (lambda path: write_film(path, [t + 4500 for t in EVEN], format="matroska"), ALL),
+    "long last frame": (lambda path: write_film(path, last=20 * PERIOD), ALL),
+    "missing frame": (
+        lambda path: write_film(path, [t for t in EVEN if t != 1000]),
+        [*range(11), *range(10, 23)],
+    ),
+    "repeated stamp": (_repeat, [*range(14), 15, *range(15, 24)]),
+    "jitter": (lambda path: write_film(path, [t + (-1) ** (t // PERIOD) * 12 for t in EVEN]), ALL),
+    "edit list": (lambda path: write_film(path, [t - 5 * PERIOD for t in EVEN]), ALL[5:]),
+    "open group": (
+        lambda path: write_film(path, codec="mpeg2video", format="mpegts", bf="2", g="9", cut=9),
+        ALL[12:],
     ),
 }
-"""Writer of each film that is read."""
+"""Writer of each film, and the number of its frame at each moment."""
+
+
+def write_paused(path):
+    """Frames 7 and 8 are 0.37 s apart."""
+    return write_film(path, PAUSED)
