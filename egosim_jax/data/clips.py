@@ -150,7 +150,7 @@ def check_clip(
         sizes["first_frame"] = _read_first_frame(files.first_frame).shape[:2]
     except InputError as error:
         problems.append(str(error))
-    if resampling == "rate" or policy == "strict":
+    if resampling == "rate" or (resampling == "first" and policy == "strict"):
         problems += _rate_problems(probed)
     if policy == "strict":
         taken = _taken(probed, spec, resampling)
@@ -270,7 +270,8 @@ def _rate_problems(probed: dict[str, VideoInfo]) -> list[str]:
         f"the frame rates disagree: {_table({n: f'{float(r):g}' for n, r in rates.items()})}. "
         "Frame k of each must be of one time. Write all at one rate, for instance with "
         f"`{CONVERT.format(f'{float(min(rates.values())):.6g}')}`, which keeps times, or `ffmpeg "
-        f"-r {float(min(rates.values())):.6g} -i IN OUT`, which keeps frames."
+        f"-r {float(min(rates.values())):.6g} -i IN OUT`, which keeps frames. "
+        f"The rule linspace and {LENIENT} do not look at rates. (--resampling)"
     ]
 
 

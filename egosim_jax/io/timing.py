@@ -182,7 +182,7 @@ def _rate(times_s: np.ndarray, unit_s: float, declared: Sequence[Fraction]) -> F
         tolerance = min(float(rate) * unit_s + 1e-6, 0.25)
         if np.abs(places - rounded).max() <= tolerance and jumps.min() == np.median(jumps) == 1:
             return rate
-    for rate in (*declared, *usual, *estimates):
+    for rate in (*usual, *declared, *estimates):
         if np.abs(times_s * float(rate) - np.arange(len(times_s))).max() <= 0.5:
             return rate
     return estimates[1]

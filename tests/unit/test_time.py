@@ -1,0 +1,333 @@
+"""Which video frame belongs to a time: the same rule for every reader and command."""
+
+import json
+import shutil
+from fractions import Fraction
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from egosim_jax.annotate.sources import find_sources, open_source
+from egosim_jax.data.clip_files import ClipFiles
+from egosim_jax.data.clips import load_triplet
+from egosim_jax.data.importing import import_recordings
+from egosim_jax.data.pack import pack
+from egosim_jax.data.readers.agibot import AgiBot
+from egosim_jax.data.readers.egodex import EgoDex
+from egosim_jax.data.readers.egosim import EgoSimClips
+from egosim_jax.data.readers.egovid import EgoVid
+from egosim_jax.data.readers.hot3d import Hot3D
+from egosim_jax.data.readers.lerobot import LeRobot
+from egosim_jax.data.readers.taste_rob import TasteRob
+from egosim_jax.data.recording import Recording
+from egosim_jax.evaluation.methods import Shape, read_at
+from egosim_jax.io.segments import probe_long_video, read_segment
+from egosim_jax.io.timing import Timeline, row_times
+from egosim_jax.io.video import probe_video, read_video
+from egosim_jax.types import InputError, VideoSpec
+from tests.captures import World
+from tests.films import FILMS, FPS, FRAMES, HEIGHT, WIDTH, numbers, write_film, write_paused
+from tests.unit.data.readers import test_agibot, test_egodex, test_egosim, test_egovid, test_hot3d
+
+NTSC = Fraction(1, 30000)
+KEY = "observation.images.head"
+SPEC = VideoSpec(frames=9, height=HEIGHT, width=WIDTH)
+
+
+class Filmed(World):
+    """A scene whose video is a film."""
+
+    def __init__(self, film, rows):
+        super().__init__(frames=rows, height=HEIGHT, width=WIDTH)
+        self.film = film
+
+    def write_video(self, path, **_):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(self.film, path)
+
+
+def write_lerobot(root, film, rows, version, *, fps=FPS, starts=(0.0,), stamps=None):
+    v3 = version == "v3.0"
+    place = "file-{file_index}" if v3 else "episode_{episode_index}"
+    info = {
+        "codebase_version": version,
+        "fps": fps,
+        "features": {KEY: {"dtype": "video", "shape": [HEIGHT, WIDTH, 3]}},
+        "video_path": f"videos/{place}.mp4",
+        "data_path": f"data/{place}.parquet",
+    }
+    for folder in ("meta/episodes/chunk-000", "videos", "data"):
+        (root / folder).mkdir(parents=True)
+    (root / "meta/info.json").write_text(json.dumps(info))
+    count = len(starts)
+    name = "file-0" if v3 else "episode_0"
+    shutil.copy(film, root / f"videos/{name}.mp4")
+    if stamps is not None:
+        columns = {"episode_index": [0] * rows, "frame_index": [*range(rows)], "timestamp": stamps}
+        pq.write_table(pa.table(columns), root / f"data/{name}.parquet")
+    if not v3:
+        line = {"episode_index": 0, "tasks": ["wave"], "length": rows}
+        (root / "meta/episodes.jsonl").write_text(json.dumps(line))
+        return LeRobot(source=root)
+    episodes = {
+        "episode_index": [*range(count)],
+        "length": [rows] * count,
+        "tasks": [["wave"]] * count,
+        "data/chunk_index": [0] * count,
+        "data/file_index": [0] * count,
+        f"videos/{KEY}/chunk_index": [0] * count,
+        f"videos/{KEY}/file_index": [0] * count,
+        f"videos/{KEY}/from_timestamp": [*starts],
+    }
+    pq.write_table(pa.table(episodes), root / "meta/episodes/chunk-000/file-000.parquet")
+    return LeRobot(source=root)
+
+
+def write_egodex(root, film, rows):
+    test_egodex.write_episode(Filmed(film, rows), root / "0.hdf5")
+    return EgoDex(source=root)
+
+
+def write_egovid(root, film, rows):
+    root.mkdir()
+    test_egovid.write_set(root, Filmed(film, rows), span=(0, rows))
+    return EgoVid(source=root)
+
+
+def write_agibot(root, film, rows):
+    test_agibot.write_episode(root, Filmed(film, rows), parts=False)
+    return AgiBot(source=root)
+
+
+def write_egosim(root, film, rows):
+    test_egosim.write_clip(root / "clip", Filmed(film, rows))
+    return EgoSimClips(source=root)
+
+
+def write_taste_rob(root, film, rows):
+    Filmed(film, rows).write_video(root / "a.mp4")
+    (root / "a.csv").write_text("video,caption\na.mp4,wave\n")
+    return TasteRob(source=root)
+
+
+READERS = {
+    "lerobot v2.0": lambda *args: write_lerobot(*args, "v2.0"),
+    "lerobot v2.1": lambda *args: write_lerobot(*args, "v2.1"),
+    "lerobot v3.0": lambda *args: write_lerobot(*args, "v3.0"),
+    "egodex": write_egodex,
+    "egovid": write_egovid,
+    "agibot": write_agibot,
+    "egosim": write_egosim,
+    "taste_rob": write_taste_rob,
+}
+
+
+def imported(reader, out):
+    outcomes = list(import_recordings(reader, out)[1])
+    problems = [outcome.problem for outcome in outcomes if outcome.problem]
+    return [Recording.load(out / o.recording_id) for o in outcomes if not o.problem], problems
+
+
+def make_clip(folder, film):
+    paths = {name: folder / f"{name}.mp4" for name in ("prior", "hands", "target")}
+    for path in paths.values():
+        shutil.copy(film, path)
+    return ClipFiles(
+        video_id="a", prompt="wave", mask=None, first_frame=paths["prior"], extra={}, row="1",
+        **paths,
+    )  # fmt: skip
+
+
+def by_annotate(folder, film):
+    return open_source(find_sources([film])[0]).read_frames().frames
+
+
+def by_pack(folder, film):
+    return load_triplet(make_clip(folder, film), SPEC, policy="lenient").target
+
+
+def by_rate(folder, film):
+    clip = make_clip(folder, film)
+    return load_triplet(clip, SPEC, policy="lenient", resampling="rate").hands
+
+
+def by_evaluate(folder, film):
+    probe_video(film)
+    return read_at(film, Shape(9, HEIGHT, WIDTH), 0)
+
+
+def by_segment(folder, film):
+    info = probe_long_video(film)
+    parts = [(0, 5), (5, 6), (11, info.frames - 11)]
+    return np.concatenate([read_segment(film, start=s, count=n).frames for s, n in parts])
+
+
+PATHS = {
+    "annotate": by_annotate,
+    "pack": by_pack,
+    "pack by rate": by_rate,
+    "evaluate": by_evaluate,
+    "segments": by_segment,
+    "video": lambda _, film: read_video(film).frames,
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize("film", FILMS)
+def test_a_frame_is_the_one_of_its_time(film, reader, tmp_path):
+    write, expected = FILMS[film]
+    write(tmp_path / "film.mp4")
+    dataset = READERS[reader](tmp_path / "set", tmp_path / "film.mp4", len(expected))
+    (recording,), problems = imported(dataset, tmp_path / "out")
+    assert not problems
+    assert recording.fps == FPS
+    assert numbers(recording.read_frames().frames) == expected
+
+
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("film", FILMS)
+def test_every_path_takes_the_same_frames(film, path, tmp_path):
+    write, expected = FILMS[film]
+    write(tmp_path / "film.mp4")
+    step = 3 if path == "pack by rate" else 1  # 30 to 8 fps
+    found = numbers(PATHS[path](tmp_path, tmp_path / "film.mp4"))
+    wanted = expected[::step][: len(found)]
+    assert found == wanted + wanted[-1:] * (len(found) - len(wanted))
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_a_variable_rate_is_refused_by_every_reader(reader, tmp_path):
+    film = write_paused(tmp_path / "film.mp4")
+    _, problems = imported(READERS[reader](tmp_path / "set", film, FRAMES), tmp_path / "out")
+    assert "variable frame rate" in problems[0]
+    assert "0.23 and 0.60 s" in problems[0]
+    assert "`ffmpeg -i IN -vf fps=30 OUT`" in problems[0]
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_a_variable_rate_is_refused_on_every_path(path, tmp_path):
+    film = write_paused(tmp_path / "film.mp4")
+    with pytest.raises(InputError, match=r"variable frame rate.*-vf fps=30 OUT"):
+        PATHS[path](tmp_path, film)
+
+
+def test_a_clip_of_variable_rate_is_not_packed(tmp_path):
+    clip = make_clip(tmp_path, write_paused(tmp_path / "film.mp4"))
+    problems = []
+    with pytest.raises(InputError):
+        for problem in pack([clip], out=tmp_path / "out", spec=SPEC, provenance={}):
+            problems.append(problem)
+    assert "variable frame rate" in problems[0]
+
+
+@pytest.mark.parametrize("rows", [FRAMES - 1, FRAMES + 1, FRAMES - 7, FRAMES + 9])
+@pytest.mark.parametrize("reader", [name for name in READERS if name != "taste_rob"])
+def test_of_different_lengths_what_fits_is_used(reader, rows, tmp_path, caplog):
+    film = write_film(tmp_path / "film.mp4")
+    (recording,), problems = imported(READERS[reader](tmp_path / "set", film, rows), tmp_path / "o")
+    assert not problems
+    fits = min(rows, FRAMES)
+    frames = recording.read_frames().frames
+    if reader == "egovid" and rows < FRAMES:  # flat images do not decide its poses
+        assert recording.world_from_camera is None
+        frames = frames[:fits]
+    assert numbers(frames) == [*range(FRAMES)][:fits]
+    if recording.world_from_camera is not None:
+        expected = World(frames=rows).poses[:fits]
+        np.testing.assert_allclose(recording.world_from_camera, expected, atol=1e-5)
+    if not (reader.startswith("lerobot") and rows < FRAMES):
+        assert str(rows) in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("fps", "start", "expected"),
+    [
+        (10, 0.0, [0, 3, 6, 9, 12]),
+        (10, 0.3, [9, 12, 15, 18, 21]),
+        (15, 2 / 30, [2, 4, 6, 8, 10]),
+        (20, 0, [0, 2, 3, 5, 6]),  # of two frames equally near, the later one
+        (60, 0.1, [3, 4, 4, 5, 5]),
+        (30, 0.2, [6, 7, 8, 9, 10]),
+        (29.97, 0.2, [6, 7, 8, 9, 10]),
+    ],
+)
+def test_a_table_at_another_rate_takes_frames_by_time(fps, start, expected, tmp_path):
+    film = write_film(tmp_path / "film.mp4")
+    dataset = write_lerobot(tmp_path / "set", film, 5, "v3.0", fps=fps, starts=[start])
+    ((recording,), problems) = imported(dataset, tmp_path / "out")
+    assert not problems
+    assert numbers(recording.read_frames().frames) == expected
+    assert numbers(recording.clip(2, 5).read_frames(1).frames) == expected[3:]
+    assert float(recording.fps) == pytest.approx(fps, abs=1e-3)
+
+
+def test_29_97_and_30_drift_apart_by_a_frame_after_500(tmp_path):
+    count = 560
+    film = write_film(tmp_path / "a.mp4", [1001 * k for k in range(count)], rate=30, unit=NTSC)
+    dataset = write_lerobot(tmp_path / "set", film, count, "v3.0")
+    ((recording,), _) = imported(dataset, tmp_path / "out")
+    found = np.array(numbers(recording.read_frames(495, 506).frames))
+    moved = np.arange(495, 506) - (np.arange(495, 506) >= 500)
+    np.testing.assert_array_equal(found, moved % FRAMES)
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+@pytest.mark.parametrize(
+    ("stamps", "expected"),
+    [
+        ([0.2, 0.3, 0.4, 0.5], [6, 9, 12, 15]),
+        ([0.1, 0.2, 0.3, None], [3, 6, 9]),
+        ([0.1, 0.2, 0.2, 0.3], [3, 6, 9]),
+        ([0.1, 0.2, 0.4, 0.5], [3, 6, 9, 12, 15]),
+    ],
+)
+def test_the_time_stamps_of_a_table_win_over_its_rate(version, stamps, expected, tmp_path):
+    film = write_film(tmp_path / "film.mp4")
+    dataset = write_lerobot(tmp_path / "set", film, 4, version, stamps=stamps)
+    ((recording,), problems) = imported(dataset, tmp_path / "out")
+    assert not problems
+    assert (recording.fps, numbers(recording.read_frames().frames)) == (10, expected)
+
+
+def test_images_of_hot3d_are_taken_by_their_stamps(tmp_path, monkeypatch):
+    monkeypatch.setattr(test_hot3d, "FRAMES", 7)
+    times = iter([0, 1, 2, 4, 5, 6, 7])
+    monkeypatch.setattr(
+        "builtins.round",
+        lambda x, *n, r=round: r(1e9 + next(times) * 1e9 / 30) if x >= 1e9 else r(x, *n),
+    )
+    test_hot3d.write_clip(tmp_path / "set/clip.tar")
+    monkeypatch.undo()
+    ((recording,), problems) = imported(Hot3D(source=tmp_path / "set"), tmp_path / "out")
+    assert not problems
+    assert (recording.frames, recording.fps) == (8, 30)
+    steps = recording.world_from_camera[:, 0, 3] / 0.01
+    np.testing.assert_allclose(steps, [0, 1, 2, 3, 3, 4, 5, 6], atol=1e-6)
+
+
+def test_rows_without_time_stamps_are_refused():
+    with pytest.raises(InputError, match="no time stamps"):
+        row_times([None, "a", float("nan")], [], "table")
+
+
+@pytest.mark.parametrize("rate", [30, 24, 25, 16, 10, 59.94, 29.97, 23.976])
+@pytest.mark.parametrize("unit", [1e-3, 1 / 90000])
+def test_a_constant_rate_is_found_from_rounded_stamps(rate, unit):
+    exact = Fraction(rate).limit_denominator(1001)
+    stamps = [round(k / exact / Fraction(unit)) for k in range(200) if k not in (50, 51, 120)]
+    timeline = Timeline.of(stamps, Fraction(unit), [Fraction(7)])
+    assert (timeline.fps, timeline.count) == (exact, 200)
+
+
+def test_no_frames_no_key_frame_and_repeated_stamps_are_told_apart(tmp_path, caplog):
+    write_film(tmp_path / "cut.mkv", format="matroska", g="100", cut=1)
+    with pytest.raises(InputError, match=r"no key frame.*ffmpeg -ss"):
+        probe_video(tmp_path / "cut.mkv")
+    write_film(tmp_path / "none.mkv", format="matroska", cut=FRAMES)
+    with pytest.raises(InputError, match=r"no frames|not a readable video"):
+        probe_video(tmp_path / "none.mkv")
+    FILMS["repeated stamp"][0](tmp_path / "twice.mkv")
+    probe_video(tmp_path / "twice.mkv")
+    assert "1 of 24 frames have the time stamp of another, the first one at 0.433 s" in caplog.text
