@@ -110,7 +110,7 @@ def _check_sides(hands: HandTracks, seen: np.ndarray, side: Side) -> None:
         raise RefusedError(
             "hands",
             f"hands: the {SIDES[int(shares.argmax())]} hand has the joints of the other side in "
-            f"{unlike(100 * worst, 100 * MAX_MIRRORED)}% of its frames, more than "
+            f"{unlike(100 * worst, 100 * MAX_MIRRORED, '.0f')}% of its frames, more than "
             f"{MAX_MIRRORED:.0%}: its fingers are hidden. "
             + (
                 "Annotate the parts in which they are visible. (--clips, --num-frames)"
@@ -282,7 +282,7 @@ def _on_side(hands: HandTracks, side: Side) -> HandTracks:
     if (share := _share_of_both(visible(hands))) > MAX_BOTH:
         raise RefusedError(
             "hands",
-            f"hands: two are visible in {unlike(100 * share, 100 * MAX_BOTH)}% of the frames, more "
+            f"hands: two are visible in {unlike(100 * share, 100 * MAX_BOTH, '.0f')}% of the frames, more "
             f"than {MAX_BOTH:.0%}: a side can be given to a clip with one hand. Omit it. (--side)",
             {"both": share},
         )

@@ -198,10 +198,10 @@ def quote(value: Any) -> str:
     return f"a {type(value).__name__}"
 
 
-def unlike(value: float, limit: float, *, digits: int = 3) -> str:
+def unlike(value: float, limit: float, spec: str = ".3g") -> str:
     """Return a number beyond a limit, with as many digits as show that it is not the limit."""
-    for count in range(digits, 18):
-        if float(text := f"{value:.{count}g}") != limit:
+    for form in (spec, *(f".{digits}g" for digits in range(3, 18))):
+        if float(text := f"{value:{form}}") != limit:
             return text
     return repr(value)
 

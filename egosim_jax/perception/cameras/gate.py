@@ -15,6 +15,7 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float, Int32
 
+from egosim_jax.io.bounded import unlike
 from egosim_jax.types import InputError
 
 UNBOUNDED = 1e12
@@ -140,7 +141,7 @@ def refusals(
         return (f"only {figures['registered']:.0%} of the frames were registered",)
     rules = [
         (figures["registered"] >= config.min_registered,
-         f"{unlike(100 * figures['registered'], 100 * config.min_registered)}% of the frames were "
+         f"{unlike(100 * figures['registered'], 100 * config.min_registered, '.0f')}% of the frames were "
          f"registered, below {config.min_registered:.0%}"),
         (figures["gap"] <= config.max_gap,
          f"{figures['gap']:.0f} frames in a row, or at an end, were not registered"),
@@ -149,11 +150,11 @@ def refusals(
          f"{unlike(figures['depth_spread'], config.max_depth_spread)}, above "
          f"{config.max_depth_spread:g}"),
         (abs(figures["radial"]) < config.max_radial,
-         f"radial distortion is {unlike(figures['radial'], config.max_radial)}, above "
+         f"radial distortion is {unlike(figures['radial'], config.max_radial, '.2f')}, above "
          f"{config.max_radial:g}"),
         (figures["angle_deg"] > config.min_angle_deg,
          f"the median triangulation angle is "
-         f"{unlike(figures['angle_deg'], config.min_angle_deg)} degrees, below "
+         f"{unlike(figures['angle_deg'], config.min_angle_deg, '.2f')} degrees, below "
          f"{config.min_angle_deg:g}"),
         (figures["step"] < config.max_step,
          f"the longest step is {unlike(figures['step'], config.max_step)} median steps, above "
@@ -170,7 +171,7 @@ def refusals(
 
 def _beyond(view_deg: float, config: GateConfig) -> str:
     limits = config.min_view_deg, config.max_view_deg
-    return unlike(view_deg, min(limits, key=lambda limit: abs(limit - view_deg)))
+    return unlike(view_deg, min(limits, key=lambda limit: abs(limit - view_deg)), ".0f")
 
 
 def _longest_gap(registered: Int32[np.ndarray, " r"], frames: int) -> int:

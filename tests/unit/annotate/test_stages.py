@@ -119,7 +119,7 @@ class TwoHands:
     ("hands", "side", "message"),
     [
         (TwoHands(9), "left", r"two are visible in 100% of the frames.*Omit it\. \(--side\)"),
-        (TwoHands(5), "right", r"two are visible in 55\.6%"),
+        (TwoHands(5), "right", r"two are visible in 56%"),
         (TwoHands(9, mirrored=9), "auto", r"the left hand .* 100% of.*\(--clips, --num-frames\)"),
         (MirroredHands(9), "auto", r"Give the side if there is one hand\. \(--side\)"),
     ],

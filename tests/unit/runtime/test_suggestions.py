@@ -9,8 +9,8 @@ from egosim_jax.cli.__main__ import main
     ("args", "wanted", "other"),
     [
         (["serve", "--prot", "3"], "--port", "--prompt"),
-        (["simulate", "--seeed", "3"], "--seed", "egosim rank"),
-        (["play", "--perseption", "x"], "--perception", "egosim simulate"),
+        (["simulate", "--seeed", "3"], "--seed", "in egosim"),
+        (["play", "--perseption", "x"], "--perception", "in egosim"),
         (["data", "annotate", "v.mp4", "--out", "o", "--min-hand", "1"], "--min-hands", "generate"),
         (["data", "import", "lerobot", "x", "--out", "o", "--fpss", "3"], "lerobot", "nerfstudio"),
     ],
