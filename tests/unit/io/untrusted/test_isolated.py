@@ -111,11 +111,11 @@ def chunk(path):
 
 
 def deflated(path):
-    """A chunk of 2 kB whose stream unpacks to 1.5 GB."""
+    """A chunk of 2 KiB whose stream unpacks to 700 MiB."""
     with h5py.File(path, "w") as file:
         data = file.create_dataset("x", (16, 16), "f8", chunks=(16, 16), compression="gzip")
         packer, packed = zlib.compressobj(9), b""
-        for _ in range(1500):
+        for _ in range(700):
             packed += packer.compress(bytes(1 << 20))
         data.id.write_direct_chunk((0, 0), packed + packer.flush())
 
