@@ -103,32 +103,34 @@ class MakeEpisode:
         from egosim_jax.data.crop import plan_crop
         from egosim_jax.io.images import read_image
 
-        lifted = self.image is not None and self.depth is not None and self.state is None
-        if not lifted and (self.state is None or self.depth is not None):
-            raise InputError("The scene must be given once: by --state, or by --image and --depth.")
-        if self.image is None:
-            return _read_state(self.state), None
-        image = read_image(self.image)
-        crop = plan_crop(
-            image.shape[:2],
-            (cameras.height, cameras.width),
-            name=str(self.image),
-            fix="Crop the image, or turn it, as the clips are. (--image)",
-        )
-        frame = crop.resample(image)
-        if self.state is not None:
+        frame = None
+        if self.image is not None:
+            image = read_image(self.image)
+            crop = plan_crop(
+                image.shape[:2],
+                (cameras.height, cameras.width),
+                name=str(self.image),
+                fix="Crop the image, or turn it, as the clips are. (--image)",
+            )
+            frame = crop.resample(image)
+            if self.depth is not None and self.state is None:
+                intrinsics = crop.source_intrinsics(cameras.intrinsics_px)
+                return self._lift(image, self.depth, intrinsics, cameras), frame
+        if self.state is not None and self.depth is None:
             return _read_state(self.state), frame
-        return self._lift(image, crop.source_intrinsics(cameras.intrinsics_px), cameras), frame
+        raise InputError("The scene must be given once: by --state, or by --image and --depth.")
 
-    def _lift(self, image: np.ndarray, intrinsics: np.ndarray, cameras: Cameras) -> SceneState:
+    def _lift(
+        self, image: np.ndarray, depth: Path, intrinsics: np.ndarray, cameras: Cameras
+    ) -> SceneState:
         """Return the points of an RGB-D image taken by the first camera."""
         from egosim_jax.io.untrusted.npz import read_arrays
         from egosim_jax.state.depth import state_from_depth
 
-        depth_m = read_arrays(self.depth, {}, others=("depth_m",), packed=True)["depth_m"]
+        depth_m = read_arrays(depth, {}, others=("depth_m",), packed=True)["depth_m"]
         if depth_m.shape != image.shape[:2]:
             raise InputError(
-                f"{self.depth} has shape {depth_m.shape} and {self.image} {image.shape[:2]}: depth "
+                f"{depth} has shape {depth_m.shape} and {self.image} {image.shape[:2]}: depth "
                 "must have one value per pixel of the image as it is shown (turned as EXIF says). "
                 "Compute it from that image, or resize it to that. (--depth)"
             )

@@ -74,7 +74,7 @@ def _convert(image: Image.Image, profile: bytes, name: str) -> UInt8[np.ndarray,
     try:
         if len(profile) > MAX_PROFILE_BYTES:
             raise ValueError(f"it has {len(profile):,} bytes")
-        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        source: Any = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         space = source.profile.xcolor_space.strip()
         mode = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}[space]
         if (mode == "L") > (image.mode in ("1", "L", "LA", "La")) or (

@@ -8,7 +8,6 @@ readers ask for `pixels="stored"`.
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -79,7 +78,7 @@ def decode_labels(data: bytes, name: str) -> Shaped[np.ndarray, "h w"]:
         return np.asarray(image.convert("L") if image.mode == "1" else image)
 
 
-def _open(data: bytes, name: str, formats: Sequence[str]) -> Image.Image:
+def _open(data: bytes, name: str, formats: tuple[str, ...]) -> Image.Image:
     try:
         image = Image.open(io.BytesIO(data), formats=formats)
     except UnidentifiedImageError:
