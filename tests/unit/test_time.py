@@ -1,4 +1,4 @@
-"""Which video frame belongs to a time: the same rule for every reader and command."""
+"""Video frames at given times: the same rule for every reader and command."""
 
 import json
 import shutil
@@ -320,7 +320,7 @@ def test_a_constant_rate_is_found_from_rounded_stamps(rate, unit):
     assert (timeline.fps, timeline.count) == (exact, 200)
 
 
-def test_no_frames_no_key_frame_and_repeated_stamps_are_told_apart(tmp_path, caplog):
+def test_no_frames_no_key_frame_and_repeated_stamps_have_their_own_messages(tmp_path, caplog):
     write_film(tmp_path / "cut.mkv", format="matroska", g="100", cut=1)
     with pytest.raises(InputError, match=r"no key frame.*ffmpeg -ss"):
         probe_video(tmp_path / "cut.mkv")
