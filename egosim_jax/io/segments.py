@@ -134,8 +134,8 @@ def _decode(
             stamp = stamps[0] - 1 if decoded.pts is None else decoded.pts
             if before is not None and stamp < before:
                 raise InputError(
-                    f"{name} has frames whose time stamps are not in order, as in AVI files. Encode "
-                    f"them again, for instance with `{convert(listing.timeline.fps)}`."
+                    f"{name} has frames whose time stamps are not in order, as in AVI files. "
+                    f"Encode them again, for instance with `{convert(listing.timeline.fps)}`."
                 )
             before, frame = stamp, None
             while len(kept) < len(stamps) and stamps[len(kept)] == stamp:
