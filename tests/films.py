@@ -6,6 +6,10 @@ import av
 import numpy as np
 
 HEIGHT, WIDTH, FRAMES, FPS = 96, 128, 24, 30
+QUALITY = {
+    "libx264": {"preset": "ultrafast", "crf": "8"},
+    "mpeg2video": {"qmin": "1", "qmax": "2"},
+}
 TICK = Fraction(1, 3000)
 PERIOD = 100  # ticks
 EVEN = [PERIOD * k for k in range(FRAMES)]
@@ -30,15 +34,10 @@ def write_film(path, stamps=EVEN, *, format="mp4", unit=TICK, codec="libx264", c
     with av.open(str(path), "w", format=format, options=muxing) as container:
         stream = container.add_stream(codec, rate=Fraction(rate))
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
-        quality = (
-            {"preset": "ultrafast", "crf": "8"}
-            if codec == "libx264"
-            else {"qmin": "1", "qmax": "2"}
-        )
-        stream.options = {**quality, "bf": "0", "g": "8", **options}
+        stream.options = {**QUALITY[codec], "bf": "0", "g": "8", **options}
         stream.codec_context.time_base = unit if codec == "libx264" else Fraction(1, rate)
         packets = []
-        for number, stamp in enumerate(stamps):
+        for number in range(len(stamps)):
             pixels = np.full((HEIGHT, WIDTH, 3), gray(number), np.uint8)
             frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
             # Encoders refuse repeated stamps, so packets get theirs afterwards.

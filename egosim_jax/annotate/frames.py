@@ -1,8 +1,8 @@
 """Frame rate, size and length of the clips of a recorded video, and its frames at that size.
 
 - Frame rate: by default the video's. Above 60 fps, every second, third, ... frame is taken, for at
-  most 60 fps. A given rate takes the frames nearest in time, as EgoSim does. Frames are assumed to
-  be equally spaced; `sources` refuses a variable frame rate.
+  most 60 fps. A given rate takes the frames nearest in time, as EgoSim does. Videos are
+  read at a constant rate (`io/timing.py`), and a variable one is refused.
 - Size: by default the video's, reduced to at most 832 pixels on the longer side and cropped to
   multiples of 16. A given size crops the image to its aspect ratio. A crop that loses more than
   40 % of the image, such as landscape from portrait, is refused.

@@ -36,10 +36,10 @@ def pair_rows(video: Path, info: VideoInfo, rows: int, *, what: str) -> Int[np.n
 
 
 def check_lengths(video: Path, frames: int, rows: int, *, fps: float, what: str) -> int:
-    """Return how many of the frames have a row, and log what is not used.
+    """Return how many of the frames have a row, and log the rest.
 
-    Raises `InputError` if there is none, or if the table seems to have another rate: one length is
-    a multiple of the other, or 15 / 8 of it.
+    Raises `InputError` if no frame has one, or if the table seems to have another rate: one length
+    is a multiple of the other, or 15 / 8 of it.
     """
     name, fits = quote_path(video), min(frames, rows)
     if fits < 1:

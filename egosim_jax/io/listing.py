@@ -38,8 +38,8 @@ class Listing:
     def undecodable(self, name: str) -> DamagedError:
         """Return the error for frames that cannot be decoded from a key frame after an open GOP."""
         return DamagedError(
-            f"{name} is damaged, or a key frame refers to frames before it (open GOP). Write it "
-            f"anew, for instance with `{convert(self.timeline.fps)}`, and look at the result."
+            f"{name} is damaged, or a key frame refers to frames before it (open GOP). Encode "
+            f"it again, for instance with `{convert(self.timeline.fps)}`, and look at the result."
         )
 
     def report(self, name: str) -> None:
@@ -80,7 +80,7 @@ def list_frames(
             if packet.pts is None:
                 raise InputError(
                     f"{name} has a frame without a time stamp, after {len(stamps)} others: each "
-                    f"must have one. Write them anew, for instance with `{convert(rate)}`."
+                    f"must have one. Encode it again, for instance with `{convert(rate)}`."
                 )
             if packet.is_keyframe:
                 keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts))

@@ -111,7 +111,7 @@ def _read(
             raise listing.undecodable(name) from error
         if key == first:
             raise
-        # An open GOP may tell the decoder to forget frames that it knows only from the beginning.
+        # An open GOP may make the decoder forget frames that it knows only from the beginning.
         file.seek(0)
         try:
             frames = _decode(file, name, listing, first, stamps, each)
@@ -135,8 +135,8 @@ def _decode(
             stamp = stamps[0] - 1 if decoded.pts is None else decoded.pts
             if before is not None and stamp < before:
                 raise InputError(
-                    f"{name} has frames whose time stamps are not in order, as in AVI files. Write "
-                    f"them anew, for instance with `{convert(listing.timeline.fps)}`."
+                    f"{name} has frames whose time stamps are not in order, as in AVI files. "
+                    f"Encode them again, for instance with `{convert(listing.timeline.fps)}`."
                 )
             before, frame = stamp, None
             while len(kept) < len(stamps) and stamps[len(kept)] == stamp:

@@ -146,8 +146,8 @@ def row_times(
     if len(ordered) < len(numbers):
         dropped = np.setdiff1d(np.arange(len(numbers)), given[first])
         logger.warning(
-            "%s: %d of %d rows have no time stamp of their own, the first one is row %d; they are "
-            "dropped", name, len(dropped), len(numbers), dropped[0],
+            "%s: %d of %d rows have no time stamp, or a repeated one; they are dropped, the first "
+            "one is row %d", name, len(dropped), len(numbers), dropped[0],
         )  # fmt: skip
     timeline = Timeline.of((ordered / _ROW_S).tolist(), Fraction(_ROW_S), rates)
     timeline.check(name, fix="Cut it there, and use the parts.")

@@ -1,4 +1,4 @@
-"""Which video frame belongs to a time: the same rule for every reader and command."""
+"""Video frames at given times: the same rule for every reader and command."""
 
 import json
 import shutil
@@ -28,12 +28,13 @@ from egosim_jax.io.timing import Timeline, row_times
 from egosim_jax.io.video import probe_video, read_video
 from egosim_jax.types import InputError, VideoSpec
 from tests.captures import World
-from tests.films import FILMS, FPS, FRAMES, HEIGHT, WIDTH, numbers, write_film, write_paused
+from tests.films import EVEN, FILMS, FPS, FRAMES, HEIGHT, WIDTH, numbers, write_film, write_paused
 from tests.unit.data.readers import test_agibot, test_egodex, test_egosim, test_egovid, test_hot3d
 
 NTSC = Fraction(1, 30000)
 KEY = "observation.images.head"
 SPEC = VideoSpec(frames=9, height=HEIGHT, width=WIDTH)
+RATED = VideoSpec(frames=9, height=HEIGHT, width=WIDTH, fps=8)
 
 
 class Filmed(World):
@@ -150,7 +151,7 @@ def by_pack(folder, film):
 
 def by_rate(folder, film):
     clip = make_clip(folder, film)
-    return load_triplet(clip, SPEC, policy="lenient", resampling="rate").hands
+    return load_triplet(clip, RATED, policy="lenient", resampling="rate").hands
 
 
 def by_evaluate(folder, film):
@@ -215,11 +216,9 @@ def test_a_variable_rate_is_refused_on_every_path(path, tmp_path):
 
 def test_a_clip_of_variable_rate_is_not_packed(tmp_path):
     clip = make_clip(tmp_path, write_paused(tmp_path / "film.mp4"))
-    problems = []
-    with pytest.raises(InputError):
-        for problem in pack([clip], out=tmp_path / "out", spec=SPEC, provenance={}):
-            problems.append(problem)
-    assert "variable frame rate" in problems[0]
+    problem = next(pack([clip], out=tmp_path / "out", spec=SPEC, provenance={}))
+    assert problem
+    assert "variable frame rate" in problem
 
 
 @pytest.mark.parametrize("rows", [FRAMES - 1, FRAMES + 1, FRAMES - 7, FRAMES + 9])
@@ -269,7 +268,7 @@ def test_29_97_and_30_drift_apart_by_a_frame_after_500(tmp_path):
     dataset = write_lerobot(tmp_path / "set", film, count, "v3.0")
     ((recording,), _) = imported(dataset, tmp_path / "out")
     found = np.array(numbers(recording.read_frames(495, 506).frames))
-    moved = np.arange(495, 506) - (np.arange(495, 506) >= 500)
+    moved = np.arange(495, 506) - (np.arange(495, 506) > 500)
     np.testing.assert_array_equal(found, moved % FRAMES)
 
 
@@ -312,22 +311,22 @@ def test_rows_without_time_stamps_are_refused():
         row_times([None, "a", float("nan")], [], "table")
 
 
-@pytest.mark.parametrize("rate", [30, 24, 25, 16, 10, 59.94, 29.97, 23.976])
+@pytest.mark.parametrize("rate", ["30", "24", "16", "10", "60000/1001", "30000/1001", "24000/1001"])
 @pytest.mark.parametrize("unit", [1e-3, 1 / 90000])
 def test_a_constant_rate_is_found_from_rounded_stamps(rate, unit):
-    exact = Fraction(rate).limit_denominator(1001)
+    exact = Fraction(rate)
     stamps = [round(k / exact / Fraction(unit)) for k in range(200) if k not in (50, 51, 120)]
     timeline = Timeline.of(stamps, Fraction(unit), [Fraction(7)])
     assert (timeline.fps, timeline.count) == (exact, 200)
 
 
-def test_no_frames_no_key_frame_and_repeated_stamps_are_told_apart(tmp_path, caplog):
+def test_no_frames_no_key_frame_and_repeated_stamps_have_their_own_messages(tmp_path, caplog):
     write_film(tmp_path / "cut.mkv", format="matroska", g="100", cut=1)
     with pytest.raises(InputError, match=r"no key frame.*ffmpeg -ss"):
         probe_video(tmp_path / "cut.mkv")
-    write_film(tmp_path / "none.mkv", format="matroska", cut=FRAMES)
-    with pytest.raises(InputError, match=r"no frames|not a readable video"):
-        probe_video(tmp_path / "none.mkv")
+    write_film(tmp_path / "hidden.mp4", [stamp - 90_000 for stamp in EVEN])
+    with pytest.raises(InputError, match=r"holds no frames\. Export"):
+        probe_video(tmp_path / "hidden.mp4")
     FILMS["repeated stamp"][0](tmp_path / "twice.mkv")
     probe_video(tmp_path / "twice.mkv")
     assert "1 of 24 frames have the time stamp of another, the first one at 0.433 s" in caplog.text

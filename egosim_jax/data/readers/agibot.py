@@ -249,7 +249,7 @@ def _text(entry: Mapping[str, Any], name: str) -> str | None:
 
 
 def _span(part: _Part, rows: Int[np.ndarray, " f"], video: Path) -> slice:
-    """Return the frames of a part, given the row of each. Raises `InputError` if there is none."""
+    """Return the frames of a part, given the row of each. Raises `InputError` without any."""
     stop = len(rows) if part.stop is None else int(np.searchsorted(rows, part.stop))
     start = int(np.searchsorted(rows, part.start))
     if part.start < 0 or start >= stop:

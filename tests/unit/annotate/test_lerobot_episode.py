@@ -1,9 +1,12 @@
 """Episodes of LeRobot datasets: our own export, and others with hands and cameras."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from egosim_jax.annotate.lerobot_episode import episode_from_lerobot
@@ -61,6 +64,19 @@ def test_an_episode_is_read_at_another_rate_and_size_and_in_another_scene(record
     np.testing.assert_array_equal(episode.actions[0].joints_m, recorded[1][0].joints_m[::2])
     assert (episode.shape, episode.first_frame) == ((3, 64, 96), None)
     assert snapshot.fingerprint(episode.state) == snapshot.fingerprint(state)
+
+
+def test_rows_are_taken_by_their_time_stamps(recorded, tmp_path):
+    """Stamps that are twice as far apart halve the rate, whatever info.json says."""
+    shutil.copytree(recorded[0], tmp_path / "set")
+    path = next((tmp_path / "set/data").rglob("*.parquet"))
+    table = pq.read_table(path)
+    column = table.schema.get_field_index("timestamp")
+    stamps = pa.array([2 * t for t in table["timestamp"].to_pylist()], table["timestamp"].type)
+    pq.write_table(table.set_column(column, "timestamp", stamps), path)
+    episode = episode_from_lerobot(tmp_path / "set", 0, VIDEO, clips=1)
+    frames = np.floor(np.arange(VIDEO.frames) / 2 + 0.5).astype(int)
+    np.testing.assert_array_equal(episode.actions[0].joints_m, recorded[1][0].joints_m[frames])
 
 
 @pytest.mark.parametrize(
