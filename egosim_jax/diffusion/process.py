@@ -50,7 +50,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Literal, SupportsIndex, TypeVar, cast
+from typing import Any, Literal, SupportsIndex, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -362,9 +362,10 @@ def _check_prediction(process: Process, known: tuple[Prediction, ...]) -> None:
 
 def _count(steps: SupportsIndex | Sequence[int | float]) -> int | Sequence[int | float]:
     """Return a number of steps of any integer type as an int, and timesteps as they are."""
-    if np.ndim(steps) > 0:
-        return cast("Sequence[int | float]", steps)
-    count = operator.index(cast("SupportsIndex", steps))
+    given: Any = steps
+    if np.ndim(given):
+        return given
+    count = operator.index(given)
     if count < 1:
         raise InputError(f"{steps} steps cannot be sampled: at least 1 is needed. (--steps)")
     return count
