@@ -79,7 +79,7 @@ class Found(NamedTuple):
     """False if the images correlate too little with the recorded ones to find a crop."""
 
 
-Pair = tuple[UInt8[np.ndarray, "f h w 3"], UInt8[np.ndarray, "g i j 3"]]
+Pair = tuple[UInt8[np.ndarray, "_ h w 3"], UInt8[np.ndarray, "_ i j 3"]]
 """`FRAMES` frames of a method's clip and `TRUE_FRAMES` of its ground truth, over equal times."""
 
 
