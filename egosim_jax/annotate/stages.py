@@ -282,8 +282,9 @@ def _on_side(hands: HandTracks, side: Side) -> HandTracks:
     if (share := _share_of_both(visible(hands))) > MAX_BOTH:
         raise RefusedError(
             "hands",
-            f"hands: two are visible in {unlike(100 * share, 100 * MAX_BOTH, '.0f')}% of the frames, more "
-            f"than {MAX_BOTH:.0%}: a side can be given to a clip with one hand. Omit it. (--side)",
+            f"hands: two are visible in {unlike(100 * share, 100 * MAX_BOTH, '.0f')}% of the "
+            f"frames, more than {MAX_BOTH:.0%}: a side can be given to a clip with one hand. Omit "
+            "it. (--side)",
             {"both": share},
         )
     own = LEFT if side == "left" else RIGHT

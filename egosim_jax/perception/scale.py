@@ -101,12 +101,12 @@ def estimate_scale(
         return _from_height(cameras, scene, camera_height_m)
     if metric_depth is not None:
         return _from_depth(scene, metric_depth)
+    known = scene.depth_m[np.isfinite(scene.depth_m)]
+    _require(known.size > 0, "all depth is unknown")
     if joints_camera_m is not None:
         found = _from_hands(cameras, scene, joints_camera_m)
         if found is not None:
             return found
-    known = scene.depth_m[np.isfinite(scene.depth_m)]
-    _require(known.size > 0, "all depth is unknown")
     return Scale(
         meters_per_unit=ASSUMED_MEDIAN_M / float(np.median(known)),
         uncertainty=ASSUMED_ERROR,

@@ -141,8 +141,8 @@ def refusals(
         return (f"only {figures['registered']:.0%} of the frames were registered",)
     rules = [
         (figures["registered"] >= config.min_registered,
-         f"{unlike(100 * figures['registered'], 100 * config.min_registered, '.0f')}% of the frames were "
-         f"registered, below {config.min_registered:.0%}"),
+         f"{unlike(100 * figures['registered'], 100 * config.min_registered, '.0f')}% of the "
+         f"frames were registered, below {config.min_registered:.0%}"),
         (figures["gap"] <= config.max_gap,
          f"{figures['gap']:.0f} frames in a row, or at an end, were not registered"),
         (figures["depth_spread"] < config.max_depth_spread,
