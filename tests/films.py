@@ -1,6 +1,7 @@
 """Videos whose gray levels number their frames, with chosen time stamps."""
 
 from fractions import Fraction
+from typing import Any
 
 import av
 import numpy as np
@@ -32,7 +33,7 @@ def write_film(path, stamps=EVEN, *, format="mp4", unit=TICK, codec="libx264", c
     path.parent.mkdir(parents=True, exist_ok=True)
     muxing = {"avoid_negative_ts": "disabled"}
     with av.open(str(path), "w", format=format, options=muxing) as container:
-        stream = container.add_stream(codec, rate=Fraction(rate))
+        stream: Any = container.add_stream(codec, rate=Fraction(rate))
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
         stream.options = {**QUALITY[codec], "bf": "0", "g": "8", **options}
         stream.codec_context.time_base = unit if codec == "libx264" else Fraction(1, rate)

@@ -3,6 +3,7 @@
 import json
 import shutil
 from fractions import Fraction
+from functools import partial
 
 import numpy as np
 import pyarrow as pa
@@ -114,9 +115,9 @@ def write_taste_rob(root, film, rows):
 
 
 READERS = {
-    "lerobot v2.0": lambda *args: write_lerobot(*args, "v2.0"),
-    "lerobot v2.1": lambda *args: write_lerobot(*args, "v2.1"),
-    "lerobot v3.0": lambda *args: write_lerobot(*args, "v3.0"),
+    "lerobot v2.0": partial(write_lerobot, version="v2.0"),
+    "lerobot v2.1": partial(write_lerobot, version="v2.1"),
+    "lerobot v3.0": partial(write_lerobot, version="v3.0"),
     "egodex": write_egodex,
     "egovid": write_egovid,
     "agibot": write_agibot,
@@ -302,6 +303,7 @@ def test_images_of_hot3d_are_taken_by_their_stamps(tmp_path, monkeypatch):
     ((recording,), problems) = imported(Hot3D(source=tmp_path / "set"), tmp_path / "out")
     assert not problems
     assert (recording.frames, recording.fps) == (8, 30)
+    assert recording.world_from_camera is not None
     steps = recording.world_from_camera[:, 0, 3] / 0.01
     np.testing.assert_allclose(steps, [0, 1, 2, 3, 3, 4, 5, 6], atol=1e-6)
 
