@@ -55,7 +55,7 @@ COVERAGE = {
 def test_an_interval_has_the_true_mean_as_often_as_it_says(name, count):
     draw, least = COVERAGE[name]
     samples = draw(np.random.default_rng(count), (4000, count))
-    intervals = [paired_difference(sample, [0.0] * count) for sample in samples]
+    intervals = [paired_difference(sample, [0.0] * count) for sample in samples.tolist()]
     share = np.mean([found["low"] <= 0 <= found["high"] for found in intervals])
     assert least <= share <= 0.98
     if name == "normal":

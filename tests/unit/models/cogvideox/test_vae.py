@@ -23,7 +23,7 @@ def test_latents_are_decoded_in_chunks_of_the_first_and_then_two(first):
         parts.append(part)
     expected = jnp.concatenate(parts, axis=1)
     assert expected.shape[1] == 25
-    np.testing.assert_allclose(vae.decode_whole(latents), expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(vae.decode_whole(latents), expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.slow
