@@ -56,7 +56,8 @@ def hand_region(truth: GroundTruth) -> Bool[np.ndarray, "f h w"]:
 
 
 def _shape(truth: GroundTruth) -> Shape:
-    return Shape(*truth.frames.shape[:3], truth.crop)
+    frames, height, width = truth.frames.shape[:3]
+    return Shape(frames, height, width, truth.crop)
 
 
 def _object_mask(window: Window) -> Path:

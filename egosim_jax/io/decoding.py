@@ -197,7 +197,8 @@ def skip_leading(packets: Iterable[Packet | None]) -> Iterator[Packet | None]:
         if packet is not None:
             if not begun and packet.is_keyframe:
                 begun, first = True, packet.pts
-            if not begun or (None not in (first, packet.pts) and packet.pts < first):
+            early = first is not None and packet.pts is not None and packet.pts < first
+            if not begun or early:
                 continue
         yield packet
 

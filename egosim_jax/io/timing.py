@@ -158,8 +158,9 @@ def row_times(
 def _seconds(value: Any) -> float:
     if isinstance(value, list) and len(value) == 1:
         (value,) = value
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return float(value) if number and abs(value) < 1e12 else float("nan")
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e12:
+        return float("nan")
+    return float(value)
 
 
 def convert(fps: Fraction) -> str:

@@ -91,7 +91,7 @@ class Hot3D:
                 )
             cameras = [clip.camera(key, self.stream) for key in keys]
             picked, fps = clip.moments(keys, self.stream)
-            keys, cameras = ([values[n] for n in picked] for values in (keys, cameras))
+            keys, cameras = [keys[n] for n in picked], [cameras[n] for n in picked]
             lens = _lens([calibration for calibration, _ in cameras], clip.name)
             remap = Remap.of(lens)
             poses = np.concatenate([pose for _, pose in cameras])

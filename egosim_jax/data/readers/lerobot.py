@@ -82,7 +82,7 @@ class LeRobot:
         camera, fps = _choose_camera(info["features"], self.camera), rate_of(info)
         episodes = _episodes_v3 if info["codebase_version"] == "v3.0" else _episodes_v2
         # Consecutive episodes share a video and a table.
-        probe, read = (lru_cache(maxsize=1)(f) for f in (probe_long_video, _read_stamps))
+        probe, read = lru_cache(maxsize=1)(probe_long_video), lru_cache(maxsize=1)(_read_stamps)
         for episode in episodes(self.source, info, camera):
             if isinstance(episode, str):
                 index, _, problem = episode.partition(": ")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from typing import Any, SupportsIndex
+from typing import Any, SupportsIndex, cast
 
 import numpy as np
 from gymnasium import spaces
@@ -133,7 +133,8 @@ class WorldVectorEnv(VectorEnv):
     def _seeds(self, seed: Seeds) -> list[int]:
         """Return the seed of each episode; missing seeds are drawn from `np_random`."""
         several = isinstance(seed, list | tuple) or (isinstance(seed, np.ndarray) and seed.ndim > 0)
-        given = [seed_of(number) for number in (seed if several else [seed])]
+        numbers: Iterable[Any] = cast(Iterable[Any], seed) if several else [seed]
+        given = [seed_of(number) for number in numbers]
         known = [number for number in given if number is not None]
         super().reset(seed=known[0] if known else None)
         seeds = [int(self.np_random.integers(2**31)) if n is None else n for n in given]
