@@ -31,6 +31,8 @@ from egosim_jax.types import InputError, check_counts
 
 REQUIRED = ("ego_prior_video", "prompt")
 COLUMNS = ("video", "ego_prior_video", "hand_keypoint_video", "first_frame", "prompt", "video_id")
+STRIPPED = tuple(name for name in COLUMNS if name != "prompt")
+"""Columns whose cells are read without blanks at their ends."""
 TARGET = "video"
 """Column of the recorded video."""
 MASK_NAME, HANDS_NAME, IMAGE_NAME = "pc_mask_video.mp4", "hand_kp_video.mp4", "hand_inpaint.png"
@@ -60,7 +62,7 @@ def read_metadata(path: Path, *, prompts: Prompts = "prompts_rewrite") -> list[C
     first_seen: dict[str, int] = {}
     cells = 0
     for line, read in _json_rows(path) if path.suffix == ".jsonl" else csv_rows(path):
-        row = {name: cell.strip() if name in COLUMNS else cell for name, cell in read.items()}
+        row = {name: cell.strip() if name in STRIPPED else cell for name, cell in read.items()}
         found = list(_row_problems(row, first_seen))
         problems.add(f"line {line}{problem}" for problem in found)
         if not found:

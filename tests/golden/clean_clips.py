@@ -231,5 +231,5 @@ def compared(folder):
     )
     for row in scoring.run(clips):
         name = f"{row.window.output_id}, {row.method}"
-        yield name, [*map(int, row.shape), row.window.start]
+        yield name, [*map(int, row.shape[:3]), row.window.start]
         yield f"{name}, psnr_db", round(float(row.scores["psnr"]), 2)

@@ -67,7 +67,7 @@ def lora(folder, base, ends, scale):
     source.mkdir()
     save_file(tensors, source / "adapter_model.safetensors")
     if scale == "config":
-        about = {"peft_type": "LORA", "r": 2, "lora_alpha": 4, "target_modules": ["q"],
+        about = {"peft_type": "LORA", "r": 2, "lora_alpha": 4, "target_modules": list(layers),
                  "bias": "none", "use_dora": False, "use_rslora": False, "rank_pattern": {},
                  "alpha_pattern": {}, "init_lora_weights": True}  # fmt: skip
         (source / "adapter_config.json").write_text(json.dumps(about), "utf-8")
