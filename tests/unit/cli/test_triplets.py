@@ -77,7 +77,8 @@ def test_a_state_gives_the_triplet_of_its_clip(clip, action, tmp_path, capsys):
         **FILES,
     )
     assert command.run() == 0
-    triplet, expected = made(tmp_path / "out" / "metadata.csv"), to_triplet(clip)
+    triplet = made(tmp_path / "out" / "metadata.csv")
+    expected = to_triplet(clip, point_px=2)
     assert str(tmp_path / "out") in capsys.readouterr().out
     assert near(triplet.prior, expected.prior)
     assert near(triplet.hands, hand_video(clip))

@@ -144,7 +144,8 @@ def test_a_table_compares_inside_the_common_crop_and_in_own_crops(metadata, tmp_
     rows = rows_of(out)
     for method in ("wide", "left", "square", "still"):
         row = rows["clip1", method]
-        assert int(row["width"]) == pytest.approx(78, abs=1)  # columns 32 to 110
+        # columns 32 to 110, each edge found to a pixel and rounded inward
+        assert int(row["width"]) == pytest.approx(78, abs=3)
         assert int(row["height"]) == pytest.approx(96, abs=1)
     assert float(rows["clip1", "left"]["psnr"]) > 30  # stretched, it has 13
     assert float(rows["clip1", "square"]["psnr"]) > 25

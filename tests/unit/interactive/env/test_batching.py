@@ -20,6 +20,7 @@ class Counting:
     """Generator that records its batches; a clip of seed 13 fails."""
 
     renderer = reference
+    point_px = 2
 
     def __init__(self):
         self.batches, self.held = [], threading.Event()
