@@ -67,7 +67,10 @@ def read_tables(folder: Path) -> Any:
 def reference_tables(folder: Path) -> Any:
     """Read both tables with `csv.DictReader` and `json.loads` alone."""
     with (folder / "m.csv").open(newline="", encoding="utf-8-sig") as file:
-        table = [row for row in csv.DictReader(file, restval="")]
+        table = [
+            {key and key.strip(): cell for key, cell in row.items()}
+            for row in csv.DictReader(file, restval="")
+        ]
     text = (folder / "m.jsonl").read_bytes().decode("utf-8-sig")
     lines = [json.loads(line.lstrip("\ufeff")) for line in text.split("\n") if line.strip()]
     return {"m.csv": _expected(folder, table), "m.jsonl": _expected(folder, lines)}
@@ -77,6 +80,7 @@ def _expected(folder: Path, rows: list[dict[str, Any]]) -> Any:
     found = []
     for cells in rows:
         row = {key: "" if cell is None else str(cell) for key, cell in cells.items()}
+        row |= {key: row[key].strip() for key in KEYS[:-1] if key in row and key != "prompt"}
         prior = folder / row["ego_prior_video"]
         own = row["video"].replace("/", "_").removesuffix(".mp4") if "video" in row else None
         paths = [
