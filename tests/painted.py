@@ -29,6 +29,7 @@ class Painter:
 
     pause: float = 0.0
     renderer = reference
+    point_px = 2
 
     def __call__(self, view, action, first_frame, seed):
         time.sleep(self.pause)
