@@ -39,12 +39,11 @@ from egosim_jax.perception.networks.mask_tracking import TrackMasks
 from egosim_jax.perception.networks.sam3 import Sam3
 from egosim_jax.perception.pipeline import Observation, Pipeline, find_interactions
 from egosim_jax.perception.registry import register
+from egosim_jax.rendering import POINT_PX
 from egosim_jax.rendering.reference import render
 from egosim_jax.state.filter import is_hand
 from egosim_jax.types import Action, Clip, InputError, SceneState, View, check_counts
 
-POINT_PX = 2
-"""Size of the state's rendered points, in pixels."""
 DEPTH_NETWORKS = {
     "depth-anything": DepthAnything,
     "depth-pro": DepthPro,
