@@ -15,6 +15,7 @@ import optax
 from flax import nnx
 from optax.contrib import MuonDimensionNumbers, muon
 
+from egosim_jax.train.grouped import group_dimensions, grouped
 from egosim_jax.train.metric_writers import EXTRAS, check_installed
 from egosim_jax.types import InputError, MeshConfig, check_counts, check_seed
 
@@ -202,27 +203,22 @@ def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransfo
             adam_b1=config.b1,
             adam_b2=config.b2,
             consistent_rms=0.2,  # as large as an AdamW update: both share one learning rate
-            muon_weight_dimension_numbers=_matrices,
+            muon_weight_dimension_numbers=group_dimensions,
         )
-    else:
-        rule = optax.adamw(
-            rate,
-            config.b1,
-            config.b2,
-            weight_decay=config.weight_decay,
-            mask=lambda params: _map(lambda leaf: _dimensions(leaf) is not None, params),
-        )
+        clip = optax.clip_by_global_norm(config.clip_grad_norm)
+        return grouped(optax.chain(clip, rule), _dimensions)
+    rule = optax.adamw(
+        rate,
+        config.b1,
+        config.b2,
+        weight_decay=config.weight_decay,
+        mask=lambda params: _map(lambda leaf: _dimensions(leaf) is not None, params),
+    )
     return optax.chain(optax.clip_by_global_norm(config.clip_grad_norm), rule)
-
-
-def _matrices(params: Any) -> Any:
-    return _map(_dimensions, params)
 
 
 def _dimensions(leaf: nnx.Variable) -> MuonDimensionNumbers | None:
     """Return the input and output axes of a kernel `[layers?, ..., in, out]`, else None."""
-    if isinstance(leaf.get_value(), optax.MaskedNode):  # optax masks the other group's leaves
-        return None
     axes = leaf.get_metadata().get("axes", ())
     stacked = axes[:1] == ("layers",)
     rank = len(leaf.shape)

@@ -16,6 +16,9 @@ E[w(t) L(t)] over e ~ N(0, 1) and one of these draws of the time t:
                   minimum and mean over the 1000 times (the training schedule of DiffSynth, on
                   which the EgoSim release is built)
 
+With `sampler_steps` n, every second sample instead takes one of the n times that a sampler of n
+steps visits. A model that is used with few steps learns these levels best.
+
 Here t(u) is the process's `warp`, the shift of a rectified flow. The mean of L may weight the
 locations of a sample. Elements whose |f - target| exceeds a bound may count as 0 (DWM-Wan's
 trainer, at 50), so one corrupt value does not spoil an update.
@@ -23,7 +26,7 @@ trainer, at 50), so one corrupt value does not spoil an update.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import jax
@@ -32,7 +35,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from egosim_jax.diffusion.process import TIMESTEPS, DenoiseFn, Process
-from egosim_jax.types import InputError
+from egosim_jax.types import InputError, check_counts
 
 
 class Sampled(NamedTuple):
@@ -56,11 +59,19 @@ class Objective:
     """Mean of the normal of `logit-normal`; above 0 prefers noisy samples."""
     logit_std: float = 1.0
     """Standard deviation of that normal."""
+    sampler_steps: int | None = None
+    """Number of steps of the sampler whose times half of the samples take; None: no sample."""
     max_difference: float | None = None
     """Difference from the target above which an element's error counts as 0; None: no limit."""
 
     def __post_init__(self) -> None:
-        """Check the width of the logit-normal and the bound of differences."""
+        """Check the width of the logit-normal, the sampler's steps and the bound of differences."""
+        check_counts({"sampler_steps": self.sampler_steps})
+        if self.sampler_steps is not None and self.times == "diffsynth":
+            raise InputError(
+                f"The weights of diffsynth fit its own times only: omit sampler_steps, instead of "
+                f"{self.sampler_steps}. (sampler_steps)"
+            )
         if not self.logit_std > 0:
             raise InputError(f"logit_std must be above 0, not {self.logit_std}.")
         if self.max_difference is not None and not self.max_difference > 0:
@@ -74,6 +85,12 @@ class Objective:
     ) -> Float[Array, " b"]:
         """Draw a time for each sample; `key` is one key, or one for each sample."""
         keys = sample_keys(key, batch)
+        if self.sampler_steps is not None:
+            visited = jnp.asarray(process.times(self.sampler_steps)[:-1], jnp.float32)
+            own = jax.vmap(jax.random.split)(keys)
+            step = jax.vmap(lambda k: jax.random.randint(k, (), 0, 2 * len(visited)))(own[:, 1])
+            others = replace(self, sampler_steps=None).sample_times(process, own[:, 0], batch)
+            return jnp.where(step < len(visited), visited[step % len(visited)], others)
         if self.times == "diffsynth":
             times = jnp.asarray(process.times(TIMESTEPS)[:-1], jnp.float32)
             return times[jax.vmap(lambda k: jax.random.randint(k, (), 0, TIMESTEPS))(keys)]

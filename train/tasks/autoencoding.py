@@ -101,12 +101,17 @@ class Autoencoding:
         mean, logvar = vae.moments(video)
         latents = mean + jnp.exp(logvar / 2) * jax.random.normal(key, mean.shape)
         decoded = vae.decode_whole(latents)
-        mse = self.squared_error(decoded, video)
-        edge_loss = _edge_error(decoded, video)
+        loss, metrics = self.compare(decoded, video)
         kl = 0.5 * (jnp.square(mean) + jnp.exp(logvar) - 1 - logvar).mean()
-        psnr = _psnr(decoded, video).mean()
-        metrics = {"mse": mse, "edge_loss": edge_loss, "kl": kl, "psnr": psnr}
-        return decoded, mse + self.edge_weight * edge_loss + self.kl_weight * kl, metrics
+        return decoded, loss + self.kl_weight * kl, {**metrics, "kl": kl}
+
+    def compare(
+        self, decoded: Float[Array, "b f h w 3"], video: Float[Array, "b f h w 3"]
+    ) -> tuple[jax.Array, Metrics]:
+        """Return the loss of decoded frames, without the latents' term, and its terms."""
+        mse, edge_loss = self.squared_error(decoded, video), _edge_error(decoded, video)
+        metrics = {"mse": mse, "edge_loss": edge_loss, "psnr": psnr(decoded, video).mean()}
+        return mse + self.edge_weight * edge_loss, metrics
 
     def squared_error(
         self, decoded: Float[Array, "b f h w 3"], video: Float[Array, "b f h w 3"]
@@ -122,7 +127,7 @@ class Autoencoding:
         """Return the PSNR of each clip's reconstruction from the mean latents."""
         video = to_model(batch["video"])
         decoded = networks.decode_whole(networks.moments(video)[0])
-        return {"psnr": _psnr(decoded, video)}
+        return {"psnr": psnr(decoded, video)}
 
 
 def _edge_error(a: Float[Array, "b f h w 3"], b: Float[Array, "b f h w 3"]) -> jax.Array:
@@ -132,7 +137,7 @@ def _edge_error(a: Float[Array, "b f h w 3"], b: Float[Array, "b f h w 3"]) -> j
     return rows + columns
 
 
-def _psnr(
+def psnr(
     decoded: Float[Array, "b f h w 3"], video: Float[Array, "b f h w 3"]
 ) -> Float[Array, " b"]:
     """Return the PSNR of each clip in dB, of float frames clipped to [-1, 1]."""

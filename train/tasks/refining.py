@@ -112,9 +112,30 @@ class Refining(Autoencoding):
         """Return the output of `reconstruct`; the loss also has LPIPS of the given frames."""
         decoded, loss, metrics = self.reconstruct(vae, video, key)
         if self.perceptual_weight:
-            metrics["lpips"] = _lpips(decoded[:, frames], video[:, frames]).mean()
+            metrics["lpips"] = lpips(decoded[:, frames], video[:, frames]).mean()
             loss = loss + self.perceptual_weight * metrics["lpips"]
         return decoded, loss, metrics
+
+    def decoding_loss(
+        self,
+        vae: Any,
+        latents: Float[Array, "b f h w z"],
+        video: Float[Array, "b f2 h2 w2 3"],
+        key: Key[Array, ""],
+    ) -> tuple[jax.Array, Metrics]:
+        """Return the loss of decoding given latents, normalized ones, and its terms.
+
+        The latents may be a denoiser's. LPIPS compares random frames.
+        """
+        decoded = vae.decode_whole(vae.denormalize(latents))
+        loss, metrics = self.compare(decoded, video)
+        if self.perceptual_weight:
+            frames = jax.random.choice(
+                key, self.video.frames, (self.perceptual_frames,), replace=False
+            )
+            metrics["lpips"] = lpips(decoded[:, frames], video[:, frames]).mean()
+            loss = loss + self.perceptual_weight * metrics["lpips"]
+        return loss, metrics
 
     def validate(self, networks: Networks, batch: Batch) -> Metrics:
         """Return PSNR and LPIPS of each clip, reconstructed from the mean latents."""
@@ -123,7 +144,7 @@ class Refining(Autoencoding):
         if self.perceptual_weight:
             video = to_model(batch["video"])
             decoded = vae.decode_whole(vae.moments(video)[0])
-            distances = _lpips(decoded.clip(-1, 1), video)
+            distances = lpips(decoded.clip(-1, 1), video)
             metrics["lpips"] = distances.reshape(video.shape[:2]).mean(axis=1)
         return metrics
 
@@ -135,7 +156,7 @@ def motion_weights(video: Float[Array, "b f h w 3"], weight: float) -> Float[Arr
     return weights / weights.mean(axis=(2, 3), keepdims=True)
 
 
-def _lpips(
+def lpips(
     decoded: Float[Array, "b f h w 3"], video: Float[Array, "b f h w 3"]
 ) -> Float[Array, " n"]:
     """Return the distances of all b f frames."""

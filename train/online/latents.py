@@ -1,0 +1,128 @@
+"""Latents of clips made beforehand, in shards of 8 bits: 38 kB a clip.
+
+    python -m egosim_jax.train.online.latents --out FOLDER --first SEED [--stride N] [--scenes N]
+
+makes scenes, encodes their clips and writes shards. Every array of a shard has the clips as its
+leading axis. An array of floats is stored as int8 with one scale, in 1/127 of its largest value; a
+mask as bits. The encoder's 16-bit weights round latents more coarsely than that at their tails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from egosim_jax import configs
+from egosim_jax.configs.model import ModelConfig
+from egosim_jax.io.atomic import atomic_write
+from egosim_jax.train.online.pool import CHUNK, latent_shapes, make_encode
+from egosim_jax.train.online.scenes import EndlessScenes, row_of
+
+SCALE = "_scale"
+"""Suffix of the name of an array's scale."""
+SHARD = 8 * CHUNK
+"""Number of clips of a shard."""
+
+
+def write_shard(path: Path, rows: Mapping[str, np.ndarray]) -> None:
+    """Write rows of latents as a shard, atomically."""
+    arrays = {}
+    for name, array in rows.items():
+        if name == "mask":
+            arrays[name] = np.packbits(array.astype(bool).reshape(len(array), -1), axis=1)
+        elif np.issubdtype(array.dtype, np.floating):
+            scale = float(np.abs(array).max()) / 127 or 1.0
+            arrays[name] = np.round(array.astype(np.float32) / scale).astype(np.int8)
+            arrays[name + SCALE] = np.float32(scale)
+        else:
+            arrays[name] = array
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+
+
+def read_shard(path: Path, model: ModelConfig) -> dict[str, np.ndarray]:
+    """Return the rows of a shard, in the dtypes of `pool.latent_shapes`."""
+    with np.load(path) as file:
+        arrays = dict(file)
+    rows = {}
+    for name, shape in latent_shapes(model, len(arrays["ids"])).items():
+        array = arrays[name]
+        if name == "mask":
+            size = int(np.prod(shape.shape[1:]))
+            array = np.unpackbits(array, axis=1)[:, :size].reshape(shape.shape)
+        elif name + SCALE in arrays:
+            array = array.astype(np.float32) * arrays[name + SCALE]
+        rows[name] = array.astype(shape.dtype)
+    return rows
+
+
+def read_latents(
+    folder: Path, read: set[Path], model: ModelConfig, *, limit: int
+) -> Iterator[dict[str, np.ndarray]]:
+    """Yield chunks of rows of at most `limit` shards that are not in `read`, and add these."""
+    new = sorted(path for path in folder.glob("[!.]*.npz") if path not in read)
+    for path in new[:limit]:
+        read.add(path)
+        rows = read_shard(path, model)
+        for start in range(0, len(rows["ids"]) // CHUNK * CHUNK, CHUNK):
+            yield {name: array[start : start + CHUNK] for name, array in rows.items()}
+
+
+def make_latents(
+    model: ModelConfig, weights: Path, out: Path, *, first: int, stride: int, scenes: int
+) -> Iterator[int]:
+    """Write the shards of `scenes` scenes; yield the number of clips after each shard."""
+    from egosim_jax.io.weights import load
+    from egosim_jax.models import abstract
+
+    vae = abstract(model.vae)
+    load(weights / "vae.safetensors", vae)
+    encode, source = make_encode(model, vae), EndlessScenes(model=model)
+    out.mkdir(parents=True, exist_ok=True)
+    raw: list[Mapping[str, np.ndarray]] = []
+    encoded: list[Mapping[str, np.ndarray]] = []
+    made = 0
+    for seed in range(first, first + stride * scenes, stride):
+        raw += [row_of(triplet, model) for triplet in source.triplets(seed)]
+        while len(raw) >= CHUNK:
+            batch, raw = raw[:CHUNK], raw[CHUNK:]
+            rows = encode({name: np.stack([row[name] for row in batch]) for name in batch[0]})
+            encoded.append({name: np.asarray(array) for name, array in rows.items()})
+        if len(encoded) * CHUNK >= SHARD:
+            rows = {n: np.concatenate([part[n] for part in encoded]) for n in encoded[0]}
+            made, encoded = made + len(rows["ids"]), []
+            write_shard(out / f"{first}_{made:06d}.npz", rows)
+            yield made
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Parse the command line and make latents."""
+    parser = argparse.ArgumentParser(prog="python -m egosim_jax.train.online.latents")
+    parser.add_argument("--config", default="tabletop", help="name of the model")
+    parser.add_argument("--weights", type=Path, help="folder of the VAE; default: the package's")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the shards")
+    parser.add_argument("--first", type=int, required=True, help="first seed")
+    parser.add_argument("--stride", type=int, default=1, help="distance of two seeds")
+    parser.add_argument("--scenes", type=int, default=10**9, help="number of scenes")
+    options = parser.parse_args(args)
+    weights = options.weights or configs.shipped_weights(options.config)
+    began = time.monotonic()
+    for made in make_latents(
+        configs.get(options.config),
+        weights,
+        options.out,
+        first=options.first,
+        stride=options.stride,
+        scenes=options.scenes,
+    ):
+        pace = (time.monotonic() - began) / made
+        print(f"{made} clips, {pace:.2f} s each", file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    main()

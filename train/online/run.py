@@ -1,0 +1,463 @@
+"""The loop of online training: clips arrive, the denoiser and the decoder are updated in turn.
+
+The learning rates follow the share of the run's time, or of its updates, that has passed: a linear
+warm-up of `WARMUP` updates, then a cosine to a hundredth. Latents made beforehand (`latents`) are
+read first, and as they arrive. Weights are written as parts of at most 16 MiB, at intervals and at
+the end.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import queue
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from egosim_jax.conditioning.condition import ConditionDropout
+from egosim_jax.conditioning.pixels import to_model
+from egosim_jax.configs.model import ModelConfig, Networks
+from egosim_jax.diffusion.objective import Objective
+from egosim_jax.io import parts, weights
+from egosim_jax.train.deepen import deepen_weights
+from egosim_jax.train.metric_writers import JsonLines
+from egosim_jax.train.online.latents import read_latents
+from egosim_jax.train.online.pool import (
+    CHUNK,
+    Pool,
+    as_floats,
+    latent_shapes,
+    make_encode,
+    raw_shapes,
+)
+from egosim_jax.train.online.scenes import HELD_OUT, queued
+from egosim_jax.train.online.updates import (
+    OnlineState,
+    Updater,
+    make_decoder_update,
+    make_denoiser_updates,
+    make_generate,
+)
+from egosim_jax.train.tasks.autoencoding import psnr
+from egosim_jax.train.tasks.denoising import Denoising
+from egosim_jax.train.tasks.refining import Refining, lpips
+
+WARMUP = 300
+"""Updates of linear warm-up of the denoiser; the decoder has a third."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnlineTraining:
+    """Settings of an online training."""
+
+    model: ModelConfig
+    """Model to train."""
+    start: Path
+    """Folder of the weights to start from; a shallower denoiser is deepened."""
+    out: Path
+    """Folder of the run."""
+    minutes: float | None = None
+    """Duration, compilation included; None: by `updates`."""
+    updates: int | None = None
+    """Number of the denoiser's updates; the run ends at the first of both limits."""
+    workers: int = 0
+    """Number of processes that make scenes; 0: train on the given latents only."""
+    first_scene: int = 2_000_000
+    """Seed of the first scene."""
+    held_out: int = 48
+    """Number of validation scenes, of the seeds from 0."""
+    latents: Path | None = None
+    """Folder of latents made beforehand, which may still grow (`latents.py`)."""
+    batch: int = 128
+    """Clips of a denoiser's update."""
+    per_program: int = 8
+    """Updates of the denoiser in one program."""
+    learning_rate: float = 1.2e-3
+    """Peak learning rate of the denoiser."""
+    weight_decay: float = 0.05
+    """Its weight decay."""
+    ema_decay: float = 0.9995
+    """Decay of its moving average."""
+    decoder_every: int = 4
+    """Updates of the denoiser for each of the decoder; 0: the decoder stays."""
+    decoder_batch: int = 6
+    """Clips of a decoder's update."""
+    decoder_rate: float = 1e-3
+    """Peak learning rate of the decoder."""
+    decoder_ema: float = 0.998
+    """Decay of its moving average."""
+    generated: float = 0.5
+    """Fraction of the decoder's latents that the denoiser generated, from a third of the run on."""
+    clips: int = 12288
+    """Capacity of the pool of latents."""
+    frames: int = 3072
+    """Capacity of the pool of frames."""
+    seed: int = 0
+    """Seed of the batches and the noise."""
+    log_s: float = 10.0
+    """Seconds between log lines."""
+    validate_s: float = 75.0
+    """Seconds between validations."""
+    save_s: float = 120.0
+    """Seconds between writings of the weights."""
+    compiler: Mapping[str, Any] = field(default_factory=dict)
+    """Options of the compiler for the decoder's program."""
+
+    @property
+    def denoising(self) -> Denoising:
+        """Task of the denoiser."""
+        dropout = ConditionDropout(prior=0.05, mask=0.05, hands=0.05, text=0.05)
+        steps = self.model.steps
+        return Denoising(
+            model=self.model,
+            objective=Objective(sampler_steps=steps if isinstance(steps, int) else None),
+            dropout=dropout,
+            change_loss_weight=4.0,
+        )
+
+    @property
+    def refining(self) -> Refining:
+        """Task of the decoder."""
+        return Refining(
+            vae=self.model.vae,
+            video=self.model.video,
+            crop=(self.model.video.height, self.model.video.width),
+            part="decoder",
+            motion_weight=4.0,
+        )
+
+
+class Clips(threading.Thread):
+    """Reader of the queue: chunks of raw clips, and the held-out ones."""
+
+    def __init__(self, folder: Path):
+        super().__init__(daemon=True)
+        self.folder, self.chunks = folder, queue.Queue(maxsize=4)
+        self.held: list[Mapping[str, np.ndarray]] = []
+
+    def run(self) -> None:
+        """Read files as they appear."""
+        rows: list[Mapping[str, np.ndarray]] = []
+        while self.folder.is_dir():
+            for path in queued(self.folder):
+                with np.load(path) as file:
+                    row = dict(file)
+                path.unlink()
+                if path.name.startswith(HELD_OUT):
+                    self.held.append(row)
+                    continue
+                rows.append(row)
+                if len(rows) == CHUNK:
+                    self.chunks.put(stacked(rows))
+                    rows = []
+            time.sleep(0.1)
+
+
+def stacked(rows: list[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Return rows as one array each."""
+    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+
+
+class OnlineRun:
+    """A running online training."""
+
+    def __init__(self, plan: OnlineTraining):
+        self.plan, self.began = plan, time.monotonic()
+        plan.out.mkdir(parents=True, exist_ok=True)
+        self.log = JsonLines(plan.out / "metrics.jsonl", resume_after=0)
+        model = plan.model
+        start = deepen_weights(plan.start, model.dit.layers, plan.out / "start")
+        only = (*model.trained_networks, "vae")
+        self.networks = nnx.eval_shape(lambda: Networks.build(model, only=only, rngs=nnx.Rngs(0)))
+        for name in only:
+            weights.load(start / f"{name}.safetensors", getattr(self.networks, name))
+        vae, self.networks.vae = self.networks.vae, None
+        self.encode = make_encode(model, vae)
+        self.graph, params = nnx.split(self.networks)
+        self.denoiser = Updater(weight_decay=plan.weight_decay, ema_decay=plan.ema_decay)
+        self.state = self.denoiser.create(params)
+        trained = plan.refining.trained
+        self.vae_graph, decoder, self.frozen = nnx.split(Networks(vae=vae), trained, ...)
+        self.decoder = Updater(ema_decay=plan.decoder_ema)
+        self.decoder_state = self.decoder.create(decoder)
+        self.pool = Pool(latent_shapes(model, plan.clips))
+        self.frames = Pool(self._frame_shapes())
+        self.read: set[Path] = set()
+        self.held: dict[str, np.ndarray] = {}
+
+    def _frame_shapes(self) -> dict[str, jax.ShapeDtypeStruct]:
+        count, model = self.plan.frames, self.plan.model
+        latents = latent_shapes(model, count)["target"]
+        return {
+            "frames": raw_shapes(model, count)["target"],
+            "latents": latents,
+            "generated": latents,
+            "row": jax.ShapeDtypeStruct((count,), np.int32),
+        }
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the start."""
+        return time.monotonic() - self.began
+
+    def train(self) -> None:
+        """Train until the end, and write the weights."""
+        plan = self.plan
+        with TemporaryDirectory(dir=shared_memory()) as folder:
+            clips, processes = Clips(Path(folder)), []
+            try:
+                processes = start_workers(plan, Path(folder))
+                clips.start()
+                self._compile()
+                self._wait_for_clips(clips)
+                self._loop(clips)
+            finally:
+                for process in processes:
+                    process.kill()
+        self.save()
+        self._say(validation=self.validate(clips.held), done=True)
+
+    def _compile(self) -> None:
+        """Compile the programs side by side; the denoiser's is awaited."""
+        plan = self.plan
+        updates = make_denoiser_updates(
+            plan.denoising,
+            self.denoiser,
+            self.graph,
+            batch=plan.batch,
+            count=plan.per_program,
+            seed=plan.seed,
+        )
+        update = make_decoder_update(
+            plan.refining, self.decoder, self.vae_graph, batch=plan.decoder_batch, seed=plan.seed
+        )
+        rates, one = jnp.zeros(plan.per_program), np.float32(0)
+        rows = np.int32(1)
+        executor = ThreadPoolExecutor(3)
+
+        def compiled(jitted: Any, *args: Any, **options: Any) -> Any:
+            began, program = time.monotonic(), jitted.lower(*args)
+            program = program.compile(compiler_options=options or None)
+            self._say(compiled=getattr(jitted, "__name__", "?"), in_s=time.monotonic() - began)
+            return program
+
+        denoiser = executor.submit(compiled, updates, self.state, self.pool.arrays, rows, rates)
+        self.decoder_update: Future[Any] | None = None
+        if plan.decoder_every:
+            args = (self.decoder_state, self.frozen, self.frames.arrays, rows, one, one)
+            self.decoder_update = executor.submit(compiled, update, *args, **plan.compiler)
+        self.generate = make_generate(plan.model, self.graph)
+        self.updates = denoiser.result()
+        executor.shutdown(wait=False)
+
+    def _wait_for_clips(self, clips: Clips) -> None:
+        self._admit(clips, limit=10**6)
+        while len(self.pool) < min(4 * CHUNK, self.plan.clips):
+            time.sleep(0.2)
+            self._admit(clips, limit=8)
+
+    def _admit(self, clips: Clips, *, limit: int) -> None:
+        """Store latents made beforehand and encoded clips that have arrived."""
+        if self.plan.latents is not None:
+            for rows in read_latents(self.plan.latents, self.read, self.plan.model, limit=limit):
+                self.pool.append(rows)
+        for _ in range(limit):
+            try:
+                raw = clips.chunks.get_nowait()
+            except queue.Empty:
+                return
+            rows = self.encode(raw)
+            at = np.arange(CHUNK, dtype=np.int32) + self.pool.position
+            self.pool.append(rows)
+            latents = rows["target"]
+            self.frames.append(
+                {"frames": raw["target"], "latents": latents, "generated": latents, "row": at}
+            )
+
+    def _loop(self, clips: Clips) -> None:
+        plan = self.plan
+        decoder: Any = None
+        done = before = decoded = decoded_before = 0
+        pending: list[Mapping[str, jax.Array]] = []
+        first = logged = validated = saved = self.seconds
+        refreshed = 0.0
+        while (share := self._share(first, done)) < 1:
+            rate = plan.learning_rate * schedule(share)
+            rates = rate * np.minimum(1, (done + 1 + np.arange(plan.per_program)) / WARMUP)
+            self.state, metrics = self.updates(
+                self.state, self.pool.arrays, np.int32(len(self.pool)), rates.astype(np.float32)
+            )
+            done += plan.per_program
+            if decoder is None and self.decoder_update and self.decoder_update.done():
+                decoder, decoder_first = self.decoder_update.result(), share
+            if decoder is not None and len(self.frames):
+                part = (share - decoder_first) / (1 - decoder_first)
+                for _ in range(max(1, plan.per_program // plan.decoder_every)):
+                    warm = min(1.0, 3 * (decoded + 1) / WARMUP)
+                    rate = plan.decoder_rate * schedule(part) * warm
+                    self.decoder_state, others = decoder(
+                        self.decoder_state,
+                        self.frozen,
+                        self.frames.arrays,
+                        np.int32(len(self.frames)),
+                        np.float32(plan.generated if refreshed else 0),
+                        np.float32(rate),
+                    )
+                    decoded += 1
+                metrics = {**metrics, **{f"decoder_{k}": v for k, v in others.items()}}
+            pending.append(metrics)
+            if len(pending) > 2:
+                jax.block_until_ready(pending[-3]["loss"])  # two programs wait on the device
+            self._admit(clips, limit=2)
+            now = self.seconds
+            if decoder is not None and share > 1 / 3 and now - refreshed > 30:
+                self._refresh()
+                refreshed = now
+            if now - logged > plan.log_s:
+                self._say(
+                    **means(pending),
+                    step=done,
+                    rate=rate,
+                    clips=self.pool.appended,
+                    queue=clips.chunks.qsize(),
+                    updates_per_s=(done - before) / (now - logged),
+                    decoder_per_s=(decoded - decoded_before) / (now - logged),
+                )
+                pending, logged, before, decoded_before = pending[-2:], now, done, decoded
+            if now - validated > plan.validate_s:
+                validated = now
+                self._say(step=done, validation=self.validate(clips.held))
+            if now - saved > plan.save_s:
+                saved = now
+                self.save()
+        self._say(step=done, decoder_step=decoded, skipped=int(self.state.skipped))
+
+    def _share(self, first: float, done: int) -> float:
+        """Return the share of the run that has passed, of its time or of its updates."""
+        shares = []
+        if self.plan.minutes is not None:
+            shares.append((self.seconds - first) / max(1.0, 60 * self.plan.minutes - first))
+        if self.plan.updates is not None:
+            shares.append(done / self.plan.updates)
+        return max(shares)
+
+    def _refresh(self) -> None:
+        """Generate the latents of the frame pool anew."""
+        pool, frames = self.pool.arrays, self.frames.arrays
+        batch = min(128, self.plan.frames)
+        for start in range(0, len(self.frames), batch):
+            source = frames["row"][start : start + batch]
+            rows = {name: array[source] for name, array in pool.items()}
+            key = jax.random.fold_in(jax.random.key(self.plan.seed), start + int(self.seconds))
+            latents = self.generate(self.state.average, rows, key)
+            at = np.int32(min(start, self.plan.frames - batch))
+            frames["generated"] = jax.lax.dynamic_update_slice_in_dim(
+                frames["generated"], latents, at, 0
+            )
+
+    def validate(self, held: list[Mapping[str, np.ndarray]]) -> dict[str, float]:
+        """Return the denoiser's loss, and PSNR and LPIPS of decoded and of generated clips."""
+        count = len(held) // CHUNK * CHUNK
+        if not count:
+            return {}
+        networks = nnx.merge(self.graph, self.state.average)
+        totals: dict[str, float] = {}
+        for start in range(0, count, CHUNK):
+            raw = stacked(held[start : start + CHUNK])
+            rows = self.encode(raw)
+            found = self._judge(self.state.average, self.decoder_state.average, rows, raw["target"])
+            for name, value in jax.device_get(found).items():
+                totals[name] = totals.get(name, 0.0) + float(value) * CHUNK / count
+        del networks
+        return totals
+
+    @property
+    def _judge(self) -> Any:
+        if not hasattr(self, "_judged"):
+            task, model = self.plan.denoising, self.plan.model
+
+            def judge(params: Any, decoder: Any, rows: Any, video: jax.Array) -> dict[str, Any]:
+                networks = nnx.merge(self.graph, params)
+                vae: Any = nnx.merge(self.vae_graph, decoder, self.frozen).vae
+                batch = as_floats({n: jnp.asarray(v) for n, v in rows.items()})
+                batch["record"] = jnp.arange(CHUNK, dtype=jnp.int32)
+                found = {n: v.mean() for n, v in task.validate(networks, batch).items()}
+                generate = make_generate(model, self.graph)
+                latents = {
+                    "decoded": batch["target"],
+                    "generated": generate(params, rows, jax.random.key(0)).astype(jnp.float32),
+                }
+                frames = to_model(video)
+                for name, values in latents.items():
+                    clip = vae.decode_whole(vae.denormalize(values)).clip(-1, 1)
+                    found[f"{name}_psnr"] = psnr(clip, frames).mean()
+                    found[f"{name}_lpips"] = lpips(clip[:, ::4], frames[:, ::4]).mean()
+                return found
+
+            self._judged = jax.jit(judge)
+        return self._judged
+
+    def save(self) -> None:
+        """Write the averaged weights of all networks, as parts of at most 16 MiB."""
+        networks = nnx.merge(self.graph, self.state.average)
+        networks.vae = nnx.merge(self.vae_graph, self.decoder_state.average, self.frozen).vae
+        with TemporaryDirectory(dir=self.plan.out) as folder:
+            networks.save(Path(folder), dtype="float16")
+            files = sorted(Path(folder).glob("*.safetensors"))
+            parts.cut(files, self.plan.out / "weights")
+
+    def _say(self, *, validation: Mapping[str, float] | None = None, **values: Any) -> None:
+        values = {**values, **{f"validation_{n}": v for n, v in (validation or {}).items()}}
+        step = values.pop("step", int(values.pop("done", 0)))
+        numbers = "  ".join(
+            f"{n} {v:.4g}" if isinstance(v, float) else f"{n} {v}" for n, v in values.items()
+        )
+        print(f"{self.seconds:7.1f} s  step {step:>6}  {numbers}", file=sys.stderr, flush=True)
+
+
+def schedule(share: float) -> float:
+    """Return the learning rate after the warm-up as a share of its peak."""
+    return max(0.01, 0.5 * (1 + math.cos(math.pi * share)))
+
+
+def means(rows: list[Mapping[str, jax.Array]]) -> dict[str, float]:
+    """Return the mean of each metric over the rows that have it."""
+    found: dict[str, list[float]] = {}
+    for row in jax.device_get(rows):
+        for name, value in row.items():
+            found.setdefault(name, []).append(float(value))
+    return {name: float(np.mean(values)) for name, values in found.items()}
+
+
+def start_workers(plan: OnlineTraining, folder: Path) -> list[subprocess.Popen]:
+    """Start the processes that make scenes, first the held-out ones."""
+    threads = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", **dict.fromkeys(threads, "1")}
+    command = [sys.executable, "-m", "egosim_jax.train.online.scenes"]
+    command += ["--config", plan.model.name, "--queue", str(folder)]
+    command += ["--stride", str(plan.workers), "--held-out", str(plan.held_out), "--first"]
+    log = (plan.out / "scenes.log").open("a")
+    return [
+        subprocess.Popen(
+            [*command, str(plan.first_scene + number)], env=environment, stderr=log, stdout=log
+        )
+        for number in range(plan.workers)
+    ]
+
+
+def shared_memory() -> str | None:
+    """Return a folder in memory, or None where there is none."""
+    return "/dev/shm" if Path("/dev/shm").is_dir() else None

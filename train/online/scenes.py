@@ -1,0 +1,153 @@
+"""Clips of the tabletop world without end, and the process that makes them.
+
+    python -m egosim_jax.train.online.scenes --queue FOLDER --first SEED --stride N
+
+writes the clips of the scenes SEED, SEED + N, ... to the folder, each as one file that appears
+complete, and waits while the folder is full. A seed decides everything: the kind of hands, and
+whether the scene is a script, an attempt (`worlds/tabletop/attempts.py`) or idle
+(`worlds/tabletop/idle.py`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from egosim_jax import configs
+from egosim_jax.configs.model import ModelConfig
+from egosim_jax.generation.encoding import pack
+from egosim_jax.types import Triplet
+from egosim_jax.worlds.tabletop import TabletopClip, make_scripts, make_sequence, state_after
+from egosim_jax.worlds.tabletop.attempts import make_attempts
+from egosim_jax.worlds.tabletop.clips import to_triplet
+from egosim_jax.worlds.tabletop.idle import make_idle
+
+HELD_OUT = "held"
+"""Prefix of the names of held-out clips in a queue."""
+MAX_QUEUED = 400
+"""Number of files in a queue from which the processes wait."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EndlessScenes:
+    """Mixture of scenes; a seed gives the same clips everywhere."""
+
+    model: ModelConfig
+    """Model of the clips' size and conditions."""
+    clips: int = 2
+    """Clips of each scene; each starts from the state after the clip before."""
+    robots: float = 0.25
+    """Fraction of scenes with a gripper."""
+    attempts: float = 0.25
+    """Fraction of scenes in which a grasp may fail and the head turns."""
+    idle: float = 0.12
+    """Fraction of scenes whose hands rest, are absent or wander."""
+    wrong_prompts: float = 0.04
+    """Fraction of clips with the prompt of another scene: the hands decide, not the prompt."""
+    black_cloths: int = 2
+    """Maximum number of black cloths on a table, which look unobserved in a prior."""
+
+    def clips_of(self, seed: int) -> Iterator[TabletopClip]:
+        """Yield the clips of a scene."""
+        rng = np.random.default_rng([seed, 11])
+        kind = "robot" if rng.random() < self.robots else "human"
+        choice = rng.random()
+        if choice < self.idle:
+            make = make_idle
+        else:
+            make = make_attempts if choice < self.idle + self.attempts else make_sequence
+        for clip in make(
+            seed,
+            spec=self.model.video,
+            clips=self.clips,
+            kind=kind,
+            black_cloths=self.black_cloths,
+        ):
+            if rng.random() < self.wrong_prompts:
+                other = next(make_scripts(seed + 1, spec=self.model.video, kind=kind))
+                clip = replace(clip, caption=other.caption)
+            yield clip
+
+    def triplets(self, seed: int) -> Iterator[Triplet]:
+        """Yield the clips of a scene as triplets, each rendered from the state before it."""
+        state = None
+        for clip in self.clips_of(seed):
+            yield to_triplet(clip, state, point_px=self.model.point_px)
+            state = state_after(clip, state or clip.state)
+
+
+def row_of(triplet: Triplet, model: ModelConfig) -> dict[str, np.ndarray]:
+    """Return the arrays of a clip that training needs: the condition's inputs and the frames."""
+    packed = {name: array[0] for name, array in pack([triplet], model).items()}
+    return {**packed, "target": triplet.target}
+
+
+def write_row(folder: Path, name: str, row: Mapping[str, np.ndarray]) -> None:
+    """Write a row to a queue; readers see the complete file or none."""
+    hidden = folder / f".{name}.npz"
+    with hidden.open("wb") as file:
+        np.savez(file, **row)
+    hidden.rename(folder / f"{name}.npz")
+
+
+def queued(folder: Path) -> list[Path]:
+    """Return the complete files of a queue, the oldest first."""
+    with os.scandir(folder) as entries:
+        found = [(e.stat().st_mtime_ns, e.path) for e in entries if not e.name.startswith(".")]
+    return [Path(path) for _, path in sorted(found)]
+
+
+def make(
+    scenes: EndlessScenes, queue: Path, *, first: int, stride: int, held_out: int = 0
+) -> None:
+    """Make scenes until the process is ended or the queue's folder is removed.
+
+    Its part of the held-out scenes, of seeds below `held_out`, comes first: one scripted clip each.
+    """
+    for seed in range(first % stride, held_out, stride):
+        kind = "human" if seed % 4 else "robot"
+        clip = next(make_sequence(seed, spec=scenes.model.video, kind=kind, black_cloths=2))
+        triplet = to_triplet(clip, point_px=scenes.model.point_px)
+        write_row(queue, f"{HELD_OUT}_{seed}", row_of(triplet, scenes.model))
+    seed = first
+    while queue.is_dir():
+        while queue.is_dir() and len(os.listdir(queue)) >= MAX_QUEUED:
+            time.sleep(0.2)
+        try:
+            for number, triplet in enumerate(scenes.triplets(seed)):
+                write_row(queue, f"{seed}_{number}", row_of(triplet, scenes.model))
+        except FileNotFoundError:
+            return
+        except Exception as problem:  # one bad scene must not end a run on a lent machine
+            print(f"scene {seed}: {type(problem).__name__}: {problem}", file=sys.stderr, flush=True)
+        seed += stride
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Parse the command line and make scenes."""
+    parser = argparse.ArgumentParser(prog="python -m egosim_jax.train.online.scenes")
+    parser.add_argument("--config", default="tabletop", help="name of the model")
+    parser.add_argument("--queue", type=Path, required=True, help="folder of the clips")
+    parser.add_argument("--first", type=int, required=True, help="first seed")
+    parser.add_argument("--stride", type=int, default=1, help="distance of two seeds")
+    parser.add_argument("--held-out", type=int, default=0, help="scenes of validation, made first")
+    options = parser.parse_args(args)
+    scenes = EndlessScenes(model=configs.get(options.config))
+    make(
+        scenes,
+        options.queue,
+        first=options.first,
+        stride=options.stride,
+        held_out=options.held_out,
+    )
+
+
+if __name__ == "__main__":
+    main()
