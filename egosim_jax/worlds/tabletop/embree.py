@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
@@ -34,6 +34,7 @@ class Hits:
     """Unit normals of triangles; 0 where a ray hits nothing."""
 
 
+@runtime_checkable
 class Rays(Protocol):
     """Meshes that rays can hit."""
 

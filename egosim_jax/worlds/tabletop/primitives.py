@@ -1,7 +1,7 @@
 """Meshes of simple shapes: vertices and triangles, counterclockwise from outside.
 
-Sines and cosines are those of the C library: numpy's vectorized ones differ between processors, and
-a seed must give the same pixels everywhere.
+The C library gives sines and cosines: numpy's vectorized ones differ between processors, and a seed
+must give the same pixels everywhere.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-Mesh = tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"]]
+Mesh = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
 """Vertices, and the vertex indices of each triangle."""
 
 
@@ -28,7 +28,7 @@ def sphere(radius: float, resolution: int) -> Mesh:
     """Return the mesh of a sphere about the origin with `resolution` bands of latitude."""
     angles = [math.pi / resolution * k for k in range(1, resolution)]
     rings = [(math.sin(angle), math.cos(angle)) for angle in angles]
-    vertices, triangles = _revolve(rings, (1, -1), 2 * resolution)
+    vertices, triangles = _revolve(rings, (1.0, -1.0), 2 * resolution)
     return vertices * radius, triangles
 
 
@@ -40,12 +40,12 @@ def cylinder(radius: float, height: float, resolution: int) -> Mesh:
 
 def cone(radius: float, height: float, resolution: int) -> Mesh:
     """Return the mesh of an upright cone on the origin with `resolution` sides."""
-    vertices, triangles = _revolve([(radius, 0)], (0, height), resolution)
+    vertices, triangles = _revolve([(radius, 0.0)], (0.0, height), resolution)
     return vertices, triangles[:, [0, 2, 1]]  # its first pole is the lower one
 
 
 def torus(radius: float, tube: float, around: int, across: int) -> Mesh:
-    """Return the mesh of a lying torus about the origin, whose tube has the radius `tube`."""
+    """Return the mesh of a torus about the z axis; `tube` is the radius of its tube."""
     circle, section = _circle(around), _circle(across)
     flat = radius * circle[:, None] + tube * section[:, 0][None, :, None] * circle[:, None]
     height = np.broadcast_to(tube * section[:, 1], (around, across))
