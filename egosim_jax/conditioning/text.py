@@ -98,9 +98,10 @@ class PromptTokenizer:
 
 def clean_prompt(text: str) -> str:
     """Repair broken encodings, resolve HTML entities twice, make every white space one blank."""
-    import ftfy
+    if not text.isascii() or not text.isprintable() or "&" in text:  # others need no repair
+        import ftfy
 
-    text = html.unescape(html.unescape(ftfy.fix_text(text)))
+        text = html.unescape(html.unescape(ftfy.fix_text(text)))
     return re.sub(r"\s+", " ", text).strip()
 
 

@@ -17,7 +17,7 @@ from egosim_jax.data.clip_files import ClipFiles
 from egosim_jax.data.metadata import read_metadata
 from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.data.windows import read_results, windows_of
-from egosim_jax.evaluation import evaluate
+from egosim_jax.evaluation.evaluate import evaluate
 from egosim_jax.experiments.config import RealTiny
 from egosim_jax.generation.batch import BatchJob
 from egosim_jax.io.run import write_json, write_text

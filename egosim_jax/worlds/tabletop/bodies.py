@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from egosim_jax.types import InputError
+from egosim_jax.worlds.tabletop.primitives import cone, cuboid, cylinder, sphere, torus
 
 Shape = Literal["box", "cylinder", "ball", "cone", "ring", "cup", "lidded box", "drawer"]
 LOOSE: tuple[Shape, ...] = ("box", "cylinder", "ball", "cone", "ring", "cup")
@@ -129,14 +130,6 @@ class Body:
         return len(self.parts) > 1
 
 
-def mesh(kind: str, **sizes: float | int) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices and triangles of an Open3D primitive."""
-    import open3d as o3d
-
-    shape = getattr(o3d.geometry.TriangleMesh, f"create_{kind}")(**sizes)
-    return np.asarray(shape.vertices).copy(), np.asarray(shape.triangles).copy()
-
-
 def box(
     low: tuple[float | int, ...], high: tuple[float | int, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -147,7 +140,7 @@ def box(
             f"The box from {low} to {high} is empty: each coordinate of the second corner must "
             "exceed the same coordinate of the first."
         )
-    vertices, triangles = mesh("box", width=extent[0], height=extent[1], depth=extent[2])
+    vertices, triangles = cuboid(extent)
     return vertices + np.array(low), triangles
 
 
@@ -194,21 +187,18 @@ def _outline(shape: Shape, size: tuple[float, float, float]) -> tuple[np.ndarray
     if shape == "box":
         return box((-x / 2, -y / 2, 0), (x / 2, y / 2, z))
     if shape == "ball":
-        vertices, triangles = mesh("sphere", radius=radius, resolution=24)
+        vertices, triangles = sphere(radius, 24)
         return vertices + [0, 0, radius], triangles
     if shape == "ring":
         tube = z / 2
-        vertices, triangles = mesh(
-            "torus", torus_radius=radius - tube, tube_radius=tube,
-            radial_resolution=40, tubular_resolution=16,
-        )  # fmt: skip
+        vertices, triangles = torus(radius - tube, tube, 40, 16)
         return vertices + [0, 0, tube], triangles
     if shape == "cone":
-        return mesh("cone", radius=radius, height=z, resolution=40)
+        return cone(radius, z, 40)
     if shape == "cup":
         return _cup(radius, z)
-    vertices, triangles = mesh("cylinder", radius=radius, height=z, resolution=40, split=1)
-    return vertices + [0, 0, z / 2], triangles  # Open3D centers a cylinder on its origin
+    vertices, triangles = cylinder(radius, z, 40)
+    return vertices + [0, 0, z / 2], triangles
 
 
 def _cup(outer: float, height: float) -> tuple[np.ndarray, np.ndarray]:

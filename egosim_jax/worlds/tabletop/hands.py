@@ -16,7 +16,8 @@ from jaxtyping import Float
 from egosim_jax.rendering.mesh import Side
 from egosim_jax.rendering.skeleton import SKELETONS
 from egosim_jax.types import Kind
-from egosim_jax.worlds.tabletop.bodies import Paint, Part, join, mesh
+from egosim_jax.worlds.tabletop.bodies import Paint, Part, join
+from egosim_jax.worlds.tabletop.primitives import sphere
 
 KNUCKLES_M = np.array([[-0.026, 0.090, 0.0], [-0.004, 0.094, 0.002], [0.017, 0.088, 0.0],
                        [0.036, 0.078, -0.004]])  # fmt: skip
@@ -211,4 +212,4 @@ def _limb(
 
 @cache
 def _unit_ball() -> tuple[np.ndarray, np.ndarray]:
-    return mesh("sphere", radius=1.0, resolution=8)
+    return sphere(1.0, 8)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from einops import rearrange, reduce
@@ -18,6 +17,8 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from egosim_jax.geometry import pixel_rays, transform, upsample_intrinsics
 from egosim_jax.types import InputError
 from egosim_jax.worlds.tabletop.bodies import Part
+from egosim_jax.worlds.tabletop.embree import Hits, rays_among
+from egosim_jax.worlds.tabletop.primitives import Mesh
 
 SUN = np.array([-0.25, -0.50, 0.83])
 """Direction towards the light, behind the wearer's left shoulder."""
@@ -59,14 +60,12 @@ class RayCaster:
     """Renderer of the placed parts of one moment."""
 
     def __init__(self, placed: Sequence[Placed]):
-        import open3d as o3d
-
         self.placed = list(placed)
-        self.scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-        for item in self.placed:
-            vertices = transform(item.world_from_part, item.part.vertices_m)
-            triangles = item.part.triangles.astype(np.uint32)
-            self.scene.add_triangles(_tensor(vertices.astype(np.float32)), _tensor(triangles))
+        self.meshes: list[Mesh] = [
+            (transform(item.world_from_part, item.part.vertices_m), item.part.triangles)
+            for item in self.placed
+        ]
+        self.rays = rays_among(self.meshes)
 
     def render(
         self,
@@ -80,19 +79,16 @@ class RayCaster:
         self._refuse_inside(world_from_camera[:3, 3])
         rays = _world_rays(world_from_camera, intrinsics_px, height=height, width=width)
         middle = self._cast(world_from_camera, rays)
-        depth, geometry = middle["t_hit"], middle["geometry_ids"]
-        instance_ids = np.array([*(item.instance_id for item in self.placed), 0])
-        ids = instance_ids[np.where(np.isfinite(depth), geometry, len(self.placed)).astype(int)]
+        ids = np.array([*(item.instance_id for item in self.placed), 0])[middle.meshes]
         return Frame(
             colors=self._colors(world_from_camera, intrinsics_px, height, width),
-            depth_m=rearrange(depth, "(h w) -> h w", h=height),
+            depth_m=rearrange(middle.distances, "(h w) -> h w", h=height),
             ids=rearrange(ids, "(h w) -> h w", h=height),
         )
 
     def _refuse_inside(self, eye_m: np.ndarray) -> None:
-        """Raise `InputError` if a ray from the camera crosses surfaces an odd number of times."""
-        ray = np.concatenate([eye_m, [0, 0, 1]]).astype(np.float32)[None]
-        if self.scene.count_intersections(_tensor(ray), nthreads=1).item() % 2:
+        """Raise `InputError` if a ray upwards crosses surfaces an odd number of times."""
+        if sum(crossings_above(eye_m, *mesh) for mesh in self.meshes) % 2:
             place = ", ".join(f"{value:.3f}" for value in eye_m)
             raise InputError(
                 f"The camera at ({place}) m is inside an object; it must be outside all objects. "
@@ -105,8 +101,8 @@ class RayCaster:
         split = upsample_intrinsics(intrinsics_px, RAYS)
         rays = _world_rays(pose, split, height=RAYS * height, width=RAYS * width)
         hits = self._cast(pose, rays)
-        sky = ~np.isfinite(hits["t_hit"])
-        points = np.where(sky, 0, hits["t_hit"])[:, None] * rays + pose[:3, 3].astype(np.float32)
+        sky = hits.meshes < 0
+        points = np.where(sky, 0, hits.distances)[:, None] * rays + pose[:3, 3].astype(np.float32)
         albedo, normals = self._surface(points, hits)
         facing = np.einsum("nc,nc->n", normals, rays)
         normals = np.where(facing[:, None] > 0, -normals, normals)  # towards the camera
@@ -120,19 +116,19 @@ class RayCaster:
         return np.round(255 * np.clip(light, 0, 1)).astype(np.uint8)
 
     def _surface(
-        self, points: Float32[np.ndarray, "n 3"], hits: dict[str, np.ndarray]
+        self, points: Float32[np.ndarray, "n 3"], hits: Hits
     ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
         """Return albedo and normal at ray hits; arbitrary where a ray hits nothing."""
-        albedo, normals = np.zeros_like(points), hits["primitive_normals"]
+        albedo, normals = np.zeros_like(points), hits.normals
         for number, item in enumerate(self.placed):
-            (hit,) = np.nonzero(hits["geometry_ids"] == number)
+            (hit,) = np.nonzero(hits.meshes == number)
             if not len(hit):
                 continue
             pose, part = item.world_from_part.astype(np.float32), item.part
             albedo[hit] = part.paint.at((points[hit] - pose[:3, 3]) @ pose[:3, :3])
             if part.smooth:
-                corners = part.vertex_normals[part.triangles[hits["primitive_ids"][hit]]]
-                u, v = hits["primitive_uvs"][hit].T
+                corners = part.vertex_normals[part.triangles[hits.triangles[hit]]]
+                u, v = hits.weights[hit].T
                 mixed = np.einsum("nk,nkc->nc", np.stack([1 - u - v, u, v], axis=1), corners)
                 length = np.maximum(np.linalg.norm(mixed, axis=1), 1e-9)
                 normals[hit] = mixed / length[:, None] @ pose[:3, :3].T
@@ -141,20 +137,32 @@ class RayCaster:
     def _shadowed(
         self, points: Float32[np.ndarray, "n 3"], sun: Float32[np.ndarray, " 3"]
     ) -> Bool[np.ndarray, " n"]:
-        rays = np.concatenate([points, np.broadcast_to(sun, points.shape)], axis=1)
-        return self.scene.test_occlusions(_tensor(rays), nthreads=1).numpy()
+        return self.rays.blocked(points, np.broadcast_to(sun, points.shape))
 
-    def _cast(self, pose: np.ndarray, rays: Float32[np.ndarray, "n 3"]) -> dict[str, np.ndarray]:
-        """Cast rays from the camera, in one thread: clips are made in parallel processes."""
-        eye = np.broadcast_to(pose[:3, 3].astype(np.float32), rays.shape)
-        hits = self.scene.cast_rays(_tensor(np.concatenate([eye, rays], axis=1)), nthreads=1)
-        return {name: tensor.numpy() for name, tensor in hits.items()}
+    def _cast(self, pose: np.ndarray, rays: Float32[np.ndarray, "n 3"]) -> Hits:
+        """Cast rays from the camera."""
+        return self.rays.cast(np.broadcast_to(pose[:3, 3].astype(np.float32), rays.shape), rays)
 
 
-def _tensor(values: np.ndarray) -> Any:
-    import open3d as o3d
-
-    return o3d.core.Tensor(values)
+def crossings_above(
+    point_m: Float[np.ndarray, " 3"],
+    vertices_m: Float[np.ndarray, "v 3"],
+    triangles: Int[np.ndarray, "t 3"],
+) -> int:
+    """Return how many triangles of a mesh are above a point."""
+    low, high = vertices_m.min(axis=0), vertices_m.max(axis=0)
+    if (point_m[:2] < low[:2]).any() or (point_m > high).any():
+        return 0
+    x, y, z = np.moveaxis((vertices_m - point_m)[triangles], -1, 0)
+    x_next, y_next = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
+    # Seen from above, the point is in a triangle if one edge crosses the half line along +x from
+    # it. Signs round alike for both triangles of an edge, so exactly one of them has its points.
+    areas = x * y_next - x_next * y  # twice, with the edge from each corner to the next
+    crossed = ((y > 0) != (y_next > 0)) & ((areas > 0) == (y_next > y)) & (areas != 0)
+    whole = areas.sum(axis=1)
+    inside = (crossed.sum(axis=1) == 1) & (whole != 0)
+    heights = (np.roll(areas, -1, axis=1) * z)[inside].sum(axis=1) / whole[inside]
+    return int((heights > 0).sum())
 
 
 def _world_rays(

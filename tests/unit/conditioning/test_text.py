@@ -28,6 +28,15 @@ def test_prompts_are_cleaned_as_for_the_released_models(dirty, clean):
     assert clean_prompt(dirty) == clean
 
 
+def test_printable_ascii_without_entities_needs_no_repair():
+    import ftfy
+
+    text = "".join(chr(code) for code in range(32, 127) if chr(code) != "&")
+    for prompt in (text, text[::-1], "a cup `'quoted'' \\u00e9 \\n <b> #65; a--b"):
+        assert ftfy.fix_text(prompt) == prompt
+        assert clean_prompt(prompt) == " ".join(prompt.split())
+
+
 def test_byt5_ids_are_bytes_plus_three_then_one_then_zeros():
     tokens = PromptTokenizer(max_tokens=8).tokenize(["hé", ""])
     assert tokens.ids.tolist() == [[107, 198, 172, 1, 0, 0, 0, 0], [1, 0, 0, 0, 0, 0, 0, 0]]
