@@ -311,8 +311,8 @@ def test_seams_and_outline_of_a_moved_object_are_closed(renderer):
     assert (np.asarray(renderer.splat(state.points_m, FLAT, point_px=1)[1]) < 0).sum() > 100
     view = renderer.render(state, FLAT, point_px=1)
     shown = view.frames[0, ..., 0]
-    assert (shown[3:14, 3:14] == 200).all()
-    assert (shown[:, 16:] == 50).all()
+    assert (shown[4:13, 4:13] == 200).all()
+    assert (shown[:, 14:] == 50).all()
     assert (view.mask == 0).all()
     np.testing.assert_array_equal(view.depth_m[0], np.where(shown == 200, 1, 2))
 
