@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Float32, Int, Int32, UInt8
 
 from egosim_jax.geometry import invert, project, transform
 from egosim_jax.rendering.mesh_jitted import draw_mesh as draw_mesh
-from egosim_jax.rendering.reference import check_visible
+from egosim_jax.rendering.reference import GAP_MARGIN_PX, add_margin, check_visible
 from egosim_jax.rendering.skeleton import (
     BONE_RADIUS_M,
     FAR_M,
@@ -49,7 +49,10 @@ def render(state: SceneState, cameras: Cameras, *, point_px: int) -> View:
     block = 1 << max(count.bit_length() - 3, 12)
     missing = -count % block
     points = np.pad(state.points_m, ((0, missing), (0, 0)), constant_values=np.nan)
-    depth_m, index = splat(points, cameras, point_px=point_px)
+    if point_px == 1:
+        depth_m, index = close_gaps(*splat(points, add_margin(cameras), point_px=1))
+    else:
+        depth_m, index = splat(points, cameras, point_px=point_px)
     check_visible(np.asarray(index[0]), count)
     colors = np.pad(state.colors, ((0, missing), (0, 0)))
     ids = np.pad(state.object_ids, (0, missing))
@@ -137,6 +140,25 @@ def _nearest_square(
             closer = (z < best[0]) | ((z == best[0]) & (n < best[1]))
             best = jnp.where(closer, z, best[0]), jnp.where(closer, n, best[1])
     return best
+
+
+@jax.jit
+@jax.vmap
+def close_gaps(
+    depth_m: Float32[Array, "r c"], index: Int32[Array, "r c"]
+) -> tuple[Float32[Array, "h w"], Int32[Array, "h w"]]:
+    """Return depth and index without their margin, with gaps closed as in `reference`."""
+    # The nearest of the negated depths is the farthest; the second window completes the closing.
+    negated, number = _nearest_square(jnp.where(index < 0, jnp.inf, -depth_m), index, 3)
+    worst = jax.lax.reduce_window(negated, -jnp.inf, jax.lax.max, (3, 3), (1, 1), "VALID")
+    inside, around = (
+        (slice(margin, -margin),) * 2 for margin in (GAP_MARGIN_PX, GAP_MARGIN_PX - 1)
+    )
+    gap = jnp.isfinite(worst) & (index[inside] < 0)
+    return (
+        jnp.where(gap, -negated[around], depth_m[inside]),
+        jnp.where(gap, number[around], index[inside]),
+    )
 
 
 @partial(jax.jit, static_argnames="gamma")

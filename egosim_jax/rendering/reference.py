@@ -2,11 +2,14 @@
 
 A point at depth z that projects to (u, v) is a square of p x p pixels: those (i, j) with
 -p/2 <= i - u < p/2 and -p/2 <= j - v < p/2. A pixel sees the nearest of the points that cover it;
-at equal depth, the first. A joint is a sphere, a bone the tube between two joints; a
+at equal depth, the first. Points of one pixel leave gaps between them; a view closes those that are
+at most two pixels wide (`close_gaps`). A joint is a sphere, a bone the tube between two joints; a
 pixel shows the shape that its ray meets first, without shading.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
@@ -25,6 +28,8 @@ from egosim_jax.types import Cameras, InputError, Kind, SceneState, View
 
 NO_POINT = np.iinfo(np.uint64).max
 """Key of a pixel that sees no point."""
+GAP_MARGIN_PX = 2
+"""Distance in pixels of the farthest points that decide whether a pixel is in a gap."""
 
 
 def splat(
@@ -94,9 +99,13 @@ def unobserved(
 def render(state: SceneState, cameras: Cameras, *, point_px: int) -> View:
     """Render a state along a camera path: Π of EgoSim's section 3.2.
 
-    Raises `InputError` if the first frame shows no point.
+    Gaps between points of one pixel are closed. Raises `InputError` if the first frame shows no
+    point.
     """
-    depth_m, index = splat(state.points_m, cameras, point_px=point_px)
+    if point_px == 1:
+        depth_m, index = close_gaps(*splat(state.points_m, add_margin(cameras), point_px=1))
+    else:
+        depth_m, index = splat(state.points_m, cameras, point_px=point_px)
     check_visible(index[0], len(state.points_m))
     return View(
         frames=paint(index, state.colors, gamma=False),
@@ -104,6 +113,46 @@ def render(state: SceneState, cameras: Cameras, *, point_px: int) -> View:
         depth_m=depth_m,
         object_ids=np.append(state.object_ids, np.int32(0))[index],
     )
+
+
+def add_margin(cameras: Cameras) -> Cameras:
+    """Return cameras whose images are larger by `GAP_MARGIN_PX` pixels on each side."""
+    intrinsics = cameras.intrinsics_px.copy()
+    intrinsics[:2, 2] += GAP_MARGIN_PX
+    height, width = (size + 2 * GAP_MARGIN_PX for size in (cameras.height, cameras.width))
+    return replace(cameras, intrinsics_px=intrinsics, height=height, width=width)
+
+
+def close_gaps(
+    depth_m: Float32[np.ndarray, "f r c"], index: Int[np.ndarray, "f r c"]
+) -> tuple[Float32[np.ndarray, "f h w"], Int[np.ndarray, "f h w"]]:
+    """Return depth and index without a margin of `GAP_MARGIN_PX`, with their gaps closed.
+
+    A gap is a pixel that sees no point but is in the morphological closing, by a square of 3 x 3
+    pixels, of the pixels that see one: wider unobserved areas keep their shape. It sees the
+    farthest of the points around it, since what is missing next to an edge is behind the edge; at
+    equal depth, the first.
+    """
+    import cv2
+
+    drawn, square = (index >= 0).astype(np.uint8), np.ones((3, 3), np.uint8)
+    closed = np.stack([cv2.morphologyEx(frame, cv2.MORPH_CLOSE, square) for frame in drawn])
+    inside = np.s_[:, GAP_MARGIN_PX:-GAP_MARGIN_PX, GAP_MARGIN_PX:-GAP_MARGIN_PX]
+    gap = (closed > drawn)[inside]
+    frame, row, column = np.nonzero(gap)
+    around = [
+        (frame, row + GAP_MARGIN_PX + down, column + GAP_MARGIN_PX + right)
+        for down in (-1, 0, 1)
+        for right in (-1, 0, 1)
+    ]
+    numbers = np.stack([index[pixels] for pixels in around])
+    depths = np.stack([depth_m[pixels] for pixels in around])
+    depths[numbers < 0] = -np.inf
+    farthest = depths.max(axis=0)
+    numbers[depths < farthest] = np.iinfo(numbers.dtype).max
+    depth_m, index = depth_m[inside].copy(), index[inside].copy()
+    depth_m[gap], index[gap] = farthest, numbers.min(axis=0)
+    return depth_m, index
 
 
 def check_visible(index: Int[np.ndarray, "h w"], count: int) -> None:

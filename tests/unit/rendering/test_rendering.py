@@ -235,15 +235,129 @@ def make_state(points, colors):
     )
 
 
-def test_both_renderers_give_the_same_view(scene):
+@pytest.mark.parametrize("size", [1, 2])
+def test_both_renderers_give_the_same_view(scene, size):
     points, colors = scene
     finite = np.isfinite(points).all(axis=1)
     state = make_state(points[finite], colors[finite])
-    views = [r.render(state, make_cameras(), point_px=2) for r in (reference, jitted)]
+    views = [r.render(state, make_cameras(), point_px=size) for r in (reference, jitted)]
     for name in ("frames", "mask", "depth_m", "object_ids"):
         expected, got = (getattr(view, name) for view in views)
         assert got.dtype == expected.dtype
         assert (got != expected).mean() <= DIFFERENT
+
+
+FLAT = Cameras(
+    world_from_camera=np.eye(4)[None],
+    intrinsics_px=np.array([[30.0, 0, 0], [0, 30.0, 0], [0, 0, 1]]),
+    height=HEIGHT,
+    width=WIDTH,
+)
+
+
+def make_points(rows, columns, depth):
+    """Return a point at the center of every pixel of the given rows and columns of `FLAT`."""
+    v, u = np.meshgrid(rows, columns, indexing="ij")
+    points = np.stack([u / 30, v / 30, np.ones(u.shape)], axis=-1) * depth
+    return points.reshape(-1, 3).astype(np.float32)
+
+
+def gray(*levels_of_points):
+    """Return a state of points in gray levels."""
+    points = np.concatenate([points for _, points in levels_of_points])
+    levels = np.repeat(
+        [level for level, _ in levels_of_points], [len(points) for _, points in levels_of_points]
+    )
+    return make_state(points, np.repeat(levels[:, None], 3, axis=1).astype(np.uint8))
+
+
+def close_by_hand(depth, index):
+    """Close the gaps of a frame pixel by pixel; the result has a margin of two pixels less."""
+    closed_depth, closed_index = depth[2:-2, 2:-2].copy(), index[2:-2, 2:-2].copy()
+    for j, i in np.argwhere(closed_index < 0):
+        # The gap and the 8 pixels around it each have a point among the 9 pixels around them.
+        corners = [(j + down, i + right) for down in (1, 2, 3) for right in (1, 2, 3)]
+        if all((index[y - 1 : y + 2, x - 1 : x + 2] >= 0).any() for y, x in corners):
+            seen = [(-depth[y, x], index[y, x]) for y, x in corners if index[y, x] >= 0]
+            closed_depth[j, i], closed_index[j, i] = min(seen)
+            closed_depth[j, i] *= -1
+    return closed_depth, closed_index
+
+
+@pytest.mark.parametrize("renderer", [reference, jitted])
+def test_gaps_are_closed_as_by_hand(renderer, scene):
+    points = np.concatenate([scene[0], scene[0] * np.float32(0.9)])
+    cameras = reference.add_margin(make_cameras())
+    depth, index = map(np.asarray, reference.splat(points, cameras, point_px=1))
+    expected_depth, expected = map(np.stack, zip(*map(close_by_hand, depth, index), strict=True))
+    before, after = (index[:, 2:-2, 2:-2] >= 0).mean(), (expected >= 0).mean()
+    assert before + 0.05 < after < 0.9
+    got_depth, got = map(np.asarray, renderer.close_gaps(depth, index.astype(np.int32)))
+    np.testing.assert_array_equal(got, expected)
+    np.testing.assert_array_equal(got_depth, expected_depth)
+
+
+@pytest.mark.parametrize("renderer", [reference, jitted])
+def test_seams_and_outline_of_a_moved_object_are_closed(renderer):
+    """Its points now have a distance of 1.5 pixels; around its former place a pixel is missing."""
+    background = np.ones((HEIGHT, WIDTH), bool)
+    background[6:15, 22:34] = False
+    background[7:14, 23:33] = True
+    background[3:15, 3:15] = False
+    state = gray(
+        (50, make_points(np.arange(HEIGHT), np.arange(WIDTH), 2)[background.ravel()]),
+        (200, make_points(np.arange(3, 15, 1.5), np.arange(3, 15, 1.5), 1)),
+    )
+    assert (np.asarray(renderer.splat(state.points_m, FLAT, point_px=1)[1]) < 0).sum() > 100
+    view = renderer.render(state, FLAT, point_px=1)
+    shown = view.frames[0, ..., 0]
+    assert (shown[4:13, 4:13] == 200).all()
+    assert (shown[:, 14:] == 50).all()
+    assert (view.mask == 0).all()
+    np.testing.assert_array_equal(view.depth_m[0], np.where(shown == 200, 1, 2))
+
+
+@pytest.mark.parametrize("renderer", [reference, jitted])
+def test_a_gap_next_to_an_edge_shows_what_is_behind_the_edge(renderer):
+    rows = np.arange(HEIGHT)
+    near, far = make_points(rows, np.arange(10), 1), make_points(rows, np.arange(11, WIDTH), 2)
+    view = renderer.render(gray((200, near), (50, far)), FLAT, point_px=1)
+    assert (view.frames[0, 1:-1, :10] == 200).all()
+    assert (view.frames[0, 1:-1, 10:] == 50).all()
+
+
+@pytest.mark.parametrize("renderer", [reference, jitted])
+@pytest.mark.parametrize("hole", [np.s_[5:8, 9:12], np.s_[:3, 30:], np.s_[10:21, 3:33]])
+def test_an_unobserved_area_of_three_pixels_or_more_keeps_its_shape(renderer, hole):
+    unobserved = np.zeros((HEIGHT, WIDTH), bool)
+    unobserved[hole] = True
+    points = make_points(np.arange(HEIGHT), np.arange(WIDTH), 1)[~unobserved.ravel()]
+    view = renderer.render(gray((90, points)), FLAT, point_px=1)
+    assert ((view.frames == 0).all(axis=-1) == unobserved).all()
+    assert (np.isinf(view.depth_m) == unobserved).all()
+
+
+@pytest.mark.parametrize("renderer", [reference, jitted])
+def test_a_gap_at_the_border_needs_points_beyond_it(renderer):
+    columns = np.arange(2, WIDTH)
+    inner = make_points(np.arange(HEIGHT), columns, 1)
+    view = renderer.render(gray((90, inner)), FLAT, point_px=1)
+    assert not view.frames[:, :, :2].any()
+    outer = make_points(np.arange(-2, HEIGHT + 2), [-1], 1)
+    view = renderer.render(gray((90, inner), (90, outer)), FLAT, point_px=1)
+    assert view.frames[:, 1:-1].all()
+
+
+@pytest.mark.parametrize("renderer", [reference, jitted])
+def test_views_of_larger_points_show_the_points_alone(renderer, scene):
+    points, colors = scene
+    finite = np.isfinite(points).all(axis=1)
+    state, cameras = make_state(points[finite], colors[finite]), make_cameras()
+    for size in (2, 3):
+        depth, index = renderer.splat(state.points_m, cameras, point_px=size)
+        view = renderer.render(state, cameras, point_px=size)
+        np.testing.assert_array_equal(view.depth_m, depth)
+        np.testing.assert_array_equal(view.frames, renderer.paint(index, state.colors, gamma=False))
 
 
 @pytest.mark.parametrize("renderer", [reference, jitted])
