@@ -102,9 +102,7 @@ def _pack(tree: Any, plan: Mapping[str, list[Member]]) -> dict[str, jax.Array]:
     }
 
 
-def _unpack(
-    groups: Mapping[str, jax.Array], like: Any, plan: Mapping[str, list[Member]]
-) -> Any:
+def _unpack(groups: Mapping[str, jax.Array], like: Any, plan: Mapping[str, list[Member]]) -> Any:
     """Return the tree of groups, with the shapes of the leaves of `like`."""
     leaves, structure = jax.tree.flatten(like)
     for name, members in plan.items():

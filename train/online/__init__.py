@@ -1,11 +1,11 @@
 """Online training of a small model: scenes are made while the accelerator trains.
 
-    processes ─clips▶ encoder ─latents▶ pool ─batches▶ denoiser
-                                  └─latents and frames▶ decoder
+processes ─clips▶ encoder ─latents▶ pool ─batches▶ denoiser
+                              └─latents and frames▶ decoder
 
-    scenes    clips without end, by seed, and the process that makes them
-    pool      what the updates draw from, on the accelerator
-    denoiser  its updates, several in one program
-    decoder   updates of the VAE's decoder beside it; its encoder stays, so that latents stay valid
-    run       the loop, its schedule, logs and weights
+scenes    clips without end, by seed, and the process that makes them
+pool      what the updates draw from, on the accelerator
+denoiser  its updates, several in one program
+decoder   updates of the VAE's decoder beside it; its encoder stays, so that latents stay valid
+run       the loop, its schedule, logs and weights
 """

@@ -13,9 +13,11 @@ import argparse
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from flax import nnx
 
 from egosim_jax import configs
 from egosim_jax.configs.model import ModelConfig
@@ -82,7 +84,8 @@ def make_latents(
 
     vae = abstract(model.vae)
     load(weights / "vae.safetensors", vae)
-    encode, source = make_encode(model, vae), EndlessScenes(model=model)
+    encode = partial(make_encode(model, vae), nnx.state(vae))
+    source = EndlessScenes(model=model)
     out.mkdir(parents=True, exist_ok=True)
     raw: list[Mapping[str, np.ndarray]] = []
     encoded: list[Mapping[str, np.ndarray]] = []

@@ -83,9 +83,11 @@ def store(arrays: Rows, rows: Rows, at: Any) -> dict[str, jax.Array]:
 
 
 def make_encode(model: ModelConfig, vae: Any) -> Any:
-    """Return the jitted function from raw rows to rows of latents, one video after the other."""
-    graph, params = nnx.split(vae)
-    params = jax.device_put(params)
+    """Return the jitted function from raw rows to rows of latents, one video after the other.
+
+    It takes the VAE's weights and the rows.
+    """
+    graph = nnx.graphdef(vae)
 
     @jax.jit
     def encode(params: Any, rows: Rows) -> dict[str, jax.Array]:
@@ -97,7 +99,7 @@ def make_encode(model: ModelConfig, vae: Any) -> Any:
             latents = jax.lax.map(lambda video: codec.encode(to_model(video)), videos)
         return {**rows, **dict(zip(names, latents, strict=True))}
 
-    return partial(encode, params)
+    return encode
 
 
 def as_floats(rows: Rows) -> dict[str, jax.Array]:

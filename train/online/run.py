@@ -15,20 +15,18 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
 from egosim_jax.conditioning.condition import ConditionDropout
-from egosim_jax.conditioning.pixels import to_model
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.diffusion.objective import Objective
 from egosim_jax.io import parts, weights
@@ -38,22 +36,21 @@ from egosim_jax.train.online.latents import read_latents
 from egosim_jax.train.online.pool import (
     CHUNK,
     Pool,
-    as_floats,
     latent_shapes,
     make_encode,
     raw_shapes,
+    videos_of,
 )
 from egosim_jax.train.online.scenes import HELD_OUT, queued
 from egosim_jax.train.online.updates import (
-    OnlineState,
     Updater,
     make_decoder_update,
     make_denoiser_updates,
     make_generate,
+    make_judge,
 )
-from egosim_jax.train.tasks.autoencoding import psnr
 from egosim_jax.train.tasks.denoising import Denoising
-from egosim_jax.train.tasks.refining import Refining, lpips
+from egosim_jax.train.tasks.refining import Refining
 
 WARMUP = 300
 """Updates of linear warm-up of the denoiser; the decoder has a third."""
@@ -185,7 +182,7 @@ class OnlineRun:
         for name in only:
             weights.load(start / f"{name}.safetensors", getattr(self.networks, name))
         vae, self.networks.vae = self.networks.vae, None
-        self.encode = make_encode(model, vae)
+        self.vae = nnx.state(vae)
         self.graph, params = nnx.split(self.networks)
         self.denoiser = Updater(weight_decay=plan.weight_decay, ema_decay=plan.ema_decay)
         self.state = self.denoiser.create(params)
@@ -231,8 +228,14 @@ class OnlineRun:
         self._say(validation=self.validate(clips.held), done=True)
 
     def _compile(self) -> None:
-        """Compile the programs side by side; the denoiser's is awaited."""
-        plan = self.plan
+        """Compile the programs side by side; those that no update needs may come later."""
+        plan, state, decoder, rows = self.plan, self.state, self.decoder_state, np.int32(1)
+        one, pool, frames = np.float32(1), self.pool.arrays, self.frames.arrays
+        raw = raw_shapes(plan.model, CHUNK)
+        latents = latent_shapes(plan.model, CHUNK)
+        for name in videos_of(plan.model):
+            latents[name] = jax.ShapeDtypeStruct(latents[name].shape, np.float32)
+        latents["pixels"] = raw["pixels"]
         updates = make_denoiser_updates(
             plan.denoising,
             self.denoiser,
@@ -244,24 +247,40 @@ class OnlineRun:
         update = make_decoder_update(
             plan.refining, self.decoder, self.vae_graph, batch=plan.decoder_batch, seed=plan.seed
         )
-        rates, one = jnp.zeros(plan.per_program), np.float32(0)
-        rows = np.int32(1)
-        executor = ThreadPoolExecutor(3)
-
-        def compiled(jitted: Any, *args: Any, **options: Any) -> Any:
-            began, program = time.monotonic(), jitted.lower(*args)
-            program = program.compile(compiler_options=options or None)
-            self._say(compiled=getattr(jitted, "__name__", "?"), in_s=time.monotonic() - began)
-            return program
-
-        denoiser = executor.submit(compiled, updates, self.state, self.pool.arrays, rows, rates)
-        self.decoder_update: Future[Any] | None = None
-        if plan.decoder_every:
-            args = (self.decoder_state, self.frozen, self.frames.arrays, rows, one, one)
-            self.decoder_update = executor.submit(compiled, update, *args, **plan.compiler)
-        self.generate = make_generate(plan.model, self.graph)
-        self.updates = denoiser.result()
+        generate = make_generate(plan.model, self.graph, batch=self.chunk)
+        judge = make_judge(plan.denoising, self.graph, self.vae_graph, CHUNK)
+        encode = make_encode(plan.model, nnx.merge(self.vae_graph, decoder.params, self.frozen).vae)
+        rates = np.zeros(plan.per_program, np.float32)
+        calls: dict[str, tuple] = {
+            "updates": (updates, {}, state, pool, rows, rates),
+            "encode": (encode, plan.compiler, self.vae, raw),
+            "decoder": (update, plan.compiler, decoder, self.frozen, frames, rows, one, one),
+            "generate": (
+                generate, {}, state.average, pool, frames["row"], frames["generated"], rows, rows,
+            ),
+            "judge": (
+                judge, plan.compiler, state.average, decoder.average, self.frozen, latents,
+                raw["target"],
+            ),
+        }  # fmt: skip
+        if not plan.decoder_every:
+            del calls["decoder"], calls["generate"]
+        executor = ThreadPoolExecutor(len(calls))
+        self.programs = {
+            name: executor.submit(self._compiled, name, *call) for name, call in calls.items()
+        }
         executor.shutdown(wait=False)
+        self.updates, self.encode = (self.programs[name].result() for name in ("updates", "encode"))
+
+    def _compiled(self, name: str, jitted: Any, options: Mapping[str, Any], *args: Any) -> Any:
+        program = jitted.lower(*args).compile(compiler_options=dict(options) or None)
+        self._say(compiled=name)
+        return program
+
+    def _ready(self, name: str) -> Any:
+        """Return a program, or None while it is being compiled."""
+        task = self.programs.get(name)
+        return task.result() if task is not None and task.done() else None
 
     def _wait_for_clips(self, clips: Clips) -> None:
         self._admit(clips, limit=10**6)
@@ -279,7 +298,7 @@ class OnlineRun:
                 raw = clips.chunks.get_nowait()
             except queue.Empty:
                 return
-            rows = self.encode(raw)
+            rows = self.encode(self.vae, raw)
             at = np.arange(CHUNK, dtype=np.int32) + self.pool.position
             self.pool.append(rows)
             latents = rows["target"]
@@ -301,8 +320,8 @@ class OnlineRun:
                 self.state, self.pool.arrays, np.int32(len(self.pool)), rates.astype(np.float32)
             )
             done += plan.per_program
-            if decoder is None and self.decoder_update and self.decoder_update.done():
-                decoder, decoder_first = self.decoder_update.result(), share
+            if decoder is None:
+                decoder, decoder_first = self._ready("decoder"), share
             if decoder is not None and len(self.frames):
                 part = (share - decoder_first) / (1 - decoder_first)
                 for _ in range(max(1, plan.per_program // plan.decoder_every)):
@@ -323,8 +342,9 @@ class OnlineRun:
                 jax.block_until_ready(pending[-3]["loss"])  # two programs wait on the device
             self._admit(clips, limit=2)
             now = self.seconds
-            if decoder is not None and share > 1 / 3 and now - refreshed > 30:
-                self._refresh()
+            generate = self._ready("generate")
+            if decoder and generate and share > 1 / 3 and now - refreshed > 30:
+                self._refresh(generate)
                 refreshed = now
             if now - logged > plan.log_s:
                 self._say(
@@ -354,61 +374,42 @@ class OnlineRun:
             shares.append(done / self.plan.updates)
         return max(shares)
 
-    def _refresh(self) -> None:
+    def _refresh(self, generate: Any) -> None:
         """Generate the latents of the frame pool anew."""
-        pool, frames = self.pool.arrays, self.frames.arrays
-        batch = min(128, self.plan.frames)
-        for start in range(0, len(self.frames), batch):
-            source = frames["row"][start : start + batch]
-            rows = {name: array[source] for name, array in pool.items()}
-            key = jax.random.fold_in(jax.random.key(self.plan.seed), start + int(self.seconds))
-            latents = self.generate(self.state.average, rows, key)
-            at = np.int32(min(start, self.plan.frames - batch))
-            frames["generated"] = jax.lax.dynamic_update_slice_in_dim(
-                frames["generated"], latents, at, 0
+        frames, seed = self.frames.arrays, np.int32(self.seconds)
+        for start in range(0, len(self.frames), self.chunk):
+            frames["generated"] = generate(
+                self.state.average,
+                self.pool.arrays,
+                frames["row"],
+                frames["generated"],
+                np.int32(start),
+                seed,
             )
+
+    @property
+    def chunk(self) -> int:
+        """Number of clips that are generated at a time."""
+        return math.gcd(self.plan.frames, 128)
 
     def validate(self, held: list[Mapping[str, np.ndarray]]) -> dict[str, float]:
         """Return the denoiser's loss, and PSNR and LPIPS of decoded and of generated clips."""
-        count = len(held) // CHUNK * CHUNK
-        if not count:
+        count, judge = len(held) // CHUNK * CHUNK, self._ready("judge")
+        if not count or judge is None:
             return {}
-        networks = nnx.merge(self.graph, self.state.average)
         totals: dict[str, float] = {}
         for start in range(0, count, CHUNK):
             raw = stacked(held[start : start + CHUNK])
-            rows = self.encode(raw)
-            found = self._judge(self.state.average, self.decoder_state.average, rows, raw["target"])
+            found = judge(
+                self.state.average,
+                self.decoder_state.average,
+                self.frozen,
+                self.encode(self.vae, raw),
+                raw["target"],
+            )
             for name, value in jax.device_get(found).items():
                 totals[name] = totals.get(name, 0.0) + float(value) * CHUNK / count
-        del networks
         return totals
-
-    @property
-    def _judge(self) -> Any:
-        if not hasattr(self, "_judged"):
-            task, model = self.plan.denoising, self.plan.model
-
-            def judge(params: Any, decoder: Any, rows: Any, video: jax.Array) -> dict[str, Any]:
-                networks = nnx.merge(self.graph, params)
-                vae: Any = nnx.merge(self.vae_graph, decoder, self.frozen).vae
-                batch = as_floats({n: jnp.asarray(v) for n, v in rows.items()})
-                batch["record"] = jnp.arange(CHUNK, dtype=jnp.int32)
-                found = {n: v.mean() for n, v in task.validate(networks, batch).items()}
-                generate = make_generate(model, self.graph)
-                latents = {
-                    "decoded": batch["target"],
-                    "generated": generate(params, rows, jax.random.key(0)).astype(jnp.float32),
-                }
-                frames = to_model(video)
-                for name, values in latents.items():
-                    clip = vae.decode_whole(vae.denormalize(values)).clip(-1, 1)
-                    found[f"{name}_psnr"] = psnr(clip, frames).mean()
-                    found[f"{name}_lpips"] = lpips(clip[:, ::4], frames[:, ::4]).mean()
-                return found
-
-            self._judged = jax.jit(judge)
-        return self._judged
 
     def save(self) -> None:
         """Write the averaged weights of all networks, as parts of at most 16 MiB."""

@@ -104,9 +104,7 @@ def queued(folder: Path) -> list[Path]:
     return [Path(path) for _, path in sorted(found)]
 
 
-def make(
-    scenes: EndlessScenes, queue: Path, *, first: int, stride: int, held_out: int = 0
-) -> None:
+def make(scenes: EndlessScenes, queue: Path, *, first: int, stride: int, held_out: int = 0) -> None:
     """Make scenes until the process is ended or the queue's folder is removed.
 
     Its part of the held-out scenes, of seeds below `held_out`, comes first: one scripted clip each.

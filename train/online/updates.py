@@ -20,8 +20,9 @@ from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.generation.generator import denoise
 from egosim_jax.train.config import OptimizerConfig, make_optimizer
 from egosim_jax.train.online.pool import Rows, as_floats
+from egosim_jax.train.tasks.autoencoding import psnr
 from egosim_jax.train.tasks.denoising import Denoising, condition_of
-from egosim_jax.train.tasks.refining import Refining
+from egosim_jax.train.tasks.refining import Refining, lpips
 from egosim_jax.train.update import Metrics
 
 UNIT = OptimizerConfig(name="muon", learning_rate=1.0)
@@ -82,9 +83,7 @@ class Updater:
         (value, metrics), gradients = gradient(state.params, batch, keys)
         valid = jnp.isfinite(value) & jnp.isfinite(optax.tree.norm(gradients))
         updates, opt_state = self.optimizer.update(gradients, state.opt_state, state.params)
-        params: Any = optax.apply_updates(
-            state.params, jax.tree.map(lambda x: rate * x, updates)
-        )
+        params: Any = optax.apply_updates(state.params, jax.tree.map(lambda x: rate * x, updates))
         # At first the average follows faster, so that it does not keep the start.
         decay = jnp.minimum(self.ema_decay, (1 + state.step) / (10 + state.step))
         changed = OnlineState(
@@ -159,17 +158,60 @@ def make_decoder_update(
     return jax.jit(update, donate_argnums=0)
 
 
-def make_generate(model: ModelConfig, graph: nnx.GraphDef) -> Any:
-    """Return the jitted function that samples the latents of pool rows with the denoiser."""
+def make_generate(model: ModelConfig, graph: nnx.GraphDef, *, batch: int) -> Any:
+    """Return the jitted function that generates the latents of part of a frame pool anew.
 
-    def generate(params: nnx.State, rows: Rows, key: Key[Array, ""]) -> jax.Array:
-        networks: Networks = nnx.merge(graph, params)
-        batch = as_floats(rows)
-        noise = jax.random.normal(key, batch["target"].shape)
-        condition = condition_of(networks, batch, model)
-        return denoise(networks.dit, condition, noise, model).astype(jnp.float16)
+    It takes the denoiser's weights, the arrays of the pool of latents, the frame pool's `row` and
+    `generated`, the first of `batch` rows, and a seed; it returns `generated`.
+    """
 
-    return jax.jit(generate)
+    def generate(
+        params: nnx.State,
+        pool: Rows,
+        row: jax.Array,
+        generated: jax.Array,
+        start: jax.Array,
+        seed: jax.Array,
+    ) -> jax.Array:
+        source = jax.lax.dynamic_slice_in_dim(row, start, batch)
+        rows = as_floats({name: array[source] for name, array in pool.items()})
+        latents = sample(params, rows, model, graph, jax.random.key(seed))
+        latents = latents.astype(generated.dtype)
+        return jax.lax.dynamic_update_slice_in_dim(generated, latents, start, 0)
+
+    return jax.jit(generate, donate_argnums=3)
+
+
+def sample(
+    params: nnx.State, rows: Rows, model: ModelConfig, graph: nnx.GraphDef, key: Key[Array, ""]
+) -> Float[Array, "b f h w z"]:
+    """Return latents that the denoiser generates under the conditions of rows."""
+    networks: Networks = nnx.merge(graph, params)
+    noise = jax.random.normal(key, rows["target"].shape)
+    return denoise(networks.dit, condition_of(networks, rows, model), noise, model)
+
+
+def make_judge(task: Denoising, graph: nnx.GraphDef, vae_graph: nnx.GraphDef, batch: int) -> Any:
+    """Return the jitted validation: losses, and PSNR and LPIPS of decoded and generated clips.
+
+    It takes the weights of denoiser and decoder, the frozen ones, encoded rows and their frames.
+    """
+
+    def judge(
+        params: nnx.State, decoder: nnx.State, frozen: nnx.State, rows: Rows, frames: jax.Array
+    ) -> Metrics:
+        vae: Any = nnx.merge(vae_graph, decoder, frozen).vae
+        examples = {**as_floats(rows), "record": jnp.arange(batch, dtype=jnp.int32)}
+        found = task.validate(nnx.merge(graph, params), examples)
+        generated = sample(params, examples, task.model, graph, jax.random.key(0))
+        video = to_model(frames)
+        for name, latents in {"decoded": examples["target"], "generated": generated}.items():
+            clip = vae.decode_whole(vae.denormalize(latents)).clip(-1, 1)
+            found[f"{name}_psnr"] = psnr(clip, video)
+            found[f"{name}_lpips"] = lpips(clip[:, ::4], video[:, ::4])
+        return {name: values.mean() for name, values in found.items()}
+
+    return jax.jit(judge)
 
 
 def _key(seed: int, step: jax.Array) -> Key[Array, ""]:
