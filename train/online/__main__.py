@@ -28,6 +28,13 @@ NO_SEARCH = {"xla_gpu_autotune_level": 0}
 The search for faster ones takes minutes for the decoder's many shapes."""
 
 
+GRAPHS = {
+    "xla_gpu_enable_command_buffer": "FUSION,CUBLAS,CUBLASLT,CUSTOM_CALL,CUDNN,WHILE,CONDITIONAL",
+    "xla_gpu_graph_min_graph_size": 1,
+}
+"""Options of a compiler that records loops, too, as CUDA graphs."""
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Parse the command line and train."""
     parser = argparse.ArgumentParser(prog="python -m egosim_jax.train.online")
@@ -37,17 +44,15 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument("--minutes", type=float, default=12.0, help="end after these")
     parser.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 2) - 2))
     parser.add_argument("--layers", type=int, help="deepen the denoiser to so many blocks")
-    parser.add_argument("--attention", default="auto", help="attention kernel")
     parser.add_argument("--latents", type=Path, help="folder of latents made beforehand")
     for name, kind in (
-        ("batch", int), ("learning_rate", float), ("decoder_every", int), ("decoder_batch", int),
+        ("batch", int), ("learning_rate", float), ("decoder_share", float), ("decoder_batch", int),
         ("decoder_rate", float), ("generated", float), ("clips", int), ("frames", int),
         ("first_scene", int), ("held_out", int), ("per_program", int), ("validate_s", float),
         ("save_s", float),
     ):  # fmt: skip
         default = OnlineTraining.__dataclass_fields__[name].default
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind, default=default)
-    parser.add_argument("--search", action="store_true", help="search the decoder's algorithms")
     options = vars(parser.parse_args(args))
 
     def run() -> int:
@@ -55,15 +60,24 @@ def main(args: Sequence[str] | None = None) -> int:
         attention.SCORES = 2**33 if gpu else attention.SCORES
         model = configs.get(options.pop("config"))
         layers = options.pop("layers") or model.dit.layers
-        kernel = options.pop("attention")
         dtype = "bfloat16" if gpu else "float32"
+        kernels = ("cudnn", "xla") if gpu else (model.dit.attention,)
         dit = replace(
-            model.dit, layers=layers, remat="none", dtype=dtype, products=None, attention=kernel
+            model.dit,
+            layers=layers,
+            remat="none",
+            dtype=dtype,
+            products=None,
+            attention=kernels[0],
         )
         start = options.pop("weights") or configs.shipped_weights(model.name)
-        compiler = {} if options.pop("search") or not gpu else NO_SEARCH
         plan = OnlineTraining(
-            model=replace(model, dit=dit), start=start, compiler=compiler, **options
+            model=replace(model, dit=dit),
+            start=start,
+            kernels=kernels,
+            compiler=NO_SEARCH if gpu else {},
+            graphs=GRAPHS if gpu else {},
+            **options,
         )
         OnlineRun(plan).train()
         return ExitCode.DONE

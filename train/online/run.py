@@ -15,14 +15,16 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
@@ -30,6 +32,7 @@ from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.diffusion.objective import Objective
 from egosim_jax.io import parts, weights
+from egosim_jax.models.attention import Kernel
 from egosim_jax.train.deepen import deepen_weights
 from egosim_jax.train.metric_writers import JsonLines
 from egosim_jax.train.online.latents import read_latents
@@ -88,8 +91,8 @@ class OnlineTraining:
     """Its weight decay."""
     ema_decay: float = 0.9995
     """Decay of its moving average."""
-    decoder_every: int = 4
-    """Updates of the denoiser for each of the decoder; 0: the decoder stays."""
+    decoder_share: float = 0.25
+    """Share of the device's time for the decoder; 0: the decoder stays."""
     decoder_batch: int = 6
     """Clips of a decoder's update."""
     decoder_rate: float = 1e-3
@@ -110,8 +113,12 @@ class OnlineTraining:
     """Seconds between validations."""
     save_s: float = 120.0
     """Seconds between writings of the weights."""
+    kernels: tuple[Kernel, ...] = ("auto",)
+    """Attention kernels to try, the likely fastest first."""
     compiler: Mapping[str, Any] = field(default_factory=dict)
-    """Options of the compiler for the decoder's program."""
+    """Options of the compiler that save time for convolutions; the default ones are tried too."""
+    graphs: Mapping[str, Any] = field(default_factory=dict)
+    """Options of the compiler to try for the denoiser, with the first kernel."""
 
     @property
     def denoising(self) -> Denoising:
@@ -135,6 +142,35 @@ class OnlineTraining:
             part="decoder",
             motion_weight=4.0,
         )
+
+
+class Choice:
+    """Forms of one program: the first that is compiled runs, until a faster one is ready."""
+
+    def __init__(self, forms: Mapping[str, Future[Any]]):
+        self.waiting = dict(forms)
+        self.label, self.seconds = "", math.inf
+        self.program: Any = None
+
+    def consider(self, trial: Callable[[Any], float]) -> list[str]:
+        """Take the fastest of the forms that are compiled; return a line for each new one.
+
+        `trial` runs a program and returns its seconds; it runs the present one again, too.
+        """
+        ready = [label for label, task in self.waiting.items() if task.done()]
+        lines = []
+        for label in ready:
+            task = self.waiting.pop(label)
+            if problem := task.exception():
+                lines.append(f"{label}: {type(problem).__name__}: {str(problem)[:200]}")
+                continue
+            if self.program is not None:
+                self.seconds = trial(self.program)
+            seconds = trial(task.result())
+            lines.append(f"{label}: {1e3 * seconds:.1f} ms, {self.label}: {1e3 * self.seconds:.1f}")
+            if seconds < self.seconds:
+                self.label, self.seconds, self.program = label, seconds, task.result()
+        return lines
 
 
 class Clips(threading.Thread):
@@ -236,14 +272,6 @@ class OnlineRun:
         for name in videos_of(plan.model):
             latents[name] = jax.ShapeDtypeStruct(latents[name].shape, np.float32)
         latents["pixels"] = raw["pixels"]
-        updates = make_denoiser_updates(
-            plan.denoising,
-            self.denoiser,
-            self.graph,
-            batch=plan.batch,
-            count=plan.per_program,
-            seed=plan.seed,
-        )
         update = make_decoder_update(
             plan.refining, self.decoder, self.vae_graph, batch=plan.decoder_batch, seed=plan.seed
         )
@@ -251,10 +279,19 @@ class OnlineRun:
         judge = make_judge(plan.denoising, self.graph, self.vae_graph, CHUNK)
         encode = make_encode(plan.model, nnx.merge(self.vae_graph, decoder.params, self.frozen).vae)
         rates = np.zeros(plan.per_program, np.float32)
+        first, *others = plan.kernels
+        forms = {"updates": (first, {})}
+        if plan.graphs:
+            forms["updates, graphs"] = (first, plan.graphs)
+        forms |= {f"updates, {kernel}": (kernel, {}) for kernel in others}
+        denoisers = {
+            name: (self._updates(kernel), options, state, pool, rows, rates)
+            for name, (kernel, options) in forms.items()
+        }
+        arguments = (decoder, self.frozen, frames, rows, one, one)
         calls: dict[str, tuple] = {
-            "updates": (updates, {}, state, pool, rows, rates),
             "encode": (encode, plan.compiler, self.vae, raw),
-            "decoder": (update, plan.compiler, decoder, self.frozen, frames, rows, one, one),
+            "decoder": (update, plan.compiler, *arguments),
             "generate": (
                 generate, {}, state.average, pool, frames["row"], frames["generated"], rows, rows,
             ),
@@ -263,24 +300,52 @@ class OnlineRun:
                 raw["target"],
             ),
         }  # fmt: skip
-        if not plan.decoder_every:
-            del calls["decoder"], calls["generate"]
-        executor = ThreadPoolExecutor(len(calls))
-        self.programs = {
-            name: executor.submit(self._compiled, name, *call) for name, call in calls.items()
-        }
-        executor.shutdown(wait=False)
-        self.updates, self.encode = (self.programs[name].result() for name in ("updates", "encode"))
+        if plan.compiler:
+            calls["decoder, searched"] = (update, {}, *arguments)
+        if not plan.decoder_share:
+            calls = {name: calls[name] for name in ("encode", "judge")}
+        # Two at a time, in order: what is needed first is not slowed down by what can wait.
+        self.tasks = {}
+        for group in (denoisers, calls):
+            executor = ThreadPoolExecutor(1)
+            for name, call in group.items():
+                self.tasks[name] = executor.submit(self._compiled, name, *call)
+            executor.shutdown(wait=False)
+        self.updates = Choice({name: self.tasks[name] for name in denoisers})
+        self.decode = Choice({n: task for n, task in self.tasks.items() if "decoder" in n})
+        self.encode = self.tasks["encode"].result()
+
+    def _updates(self, kernel: Kernel) -> Any:
+        """Return the denoiser's jitted updates with an attention kernel."""
+        plan = self.plan
+        model = replace(plan.model, dit=replace(plan.model.dit, attention=kernel))
+        only = model.trained_networks
+        networks = nnx.eval_shape(lambda: Networks.build(model, only=only, rngs=nnx.Rngs(0)))
+        return make_denoiser_updates(
+            replace(plan, model=model).denoising,
+            self.denoiser,
+            nnx.graphdef(networks),
+            batch=plan.batch,
+            count=plan.per_program,
+            seed=plan.seed,
+        )
 
     def _compiled(self, name: str, jitted: Any, options: Mapping[str, Any], *args: Any) -> Any:
-        program = jitted.lower(*args).compile(compiler_options=dict(options) or None)
+        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), args)
+        program = jitted.lower(*shapes).compile(compiler_options=dict(options) or None)
         self._say(compiled=name)
         return program
 
     def _ready(self, name: str) -> Any:
-        """Return a program, or None while it is being compiled."""
-        task = self.programs.get(name)
-        return task.result() if task is not None and task.done() else None
+        """Return a program, or None while it is being compiled or if it cannot be."""
+        task = self.tasks.get(name)
+        if task is None or not task.done():
+            return None
+        if problem := task.exception():
+            self._say(failed=name, problem=str(problem)[:200])
+            del self.tasks[name]
+            return None
+        return task.result()
 
     def _wait_for_clips(self, clips: Clips) -> None:
         self._admit(clips, limit=10**6)
@@ -308,62 +373,108 @@ class OnlineRun:
 
     def _loop(self, clips: Clips) -> None:
         plan = self.plan
-        decoder: Any = None
-        done = before = decoded = decoded_before = 0
-        pending: list[Mapping[str, jax.Array]] = []
+        self.tasks["updates"].result()
         first = logged = validated = saved = self.seconds
-        refreshed = 0.0
-        while (share := self._share(first, done)) < 1:
+        refreshed, rate, counted = 0.0, 0.0, (0, 0)
+        self.done = self.decoded = 0
+        self.decoder_first: float | None = None
+        pending: list[Mapping[str, jax.Array]] = []
+        while (share := self._share(first, self.done)) < 1:
+            for line in self.updates.consider(partial(self._trial, self._update, share)):
+                self._say(step=self.done, form=line)
+            metrics = self._update(self.updates.program, share)
             rate = plan.learning_rate * schedule(share)
-            rates = rate * np.minimum(1, (done + 1 + np.arange(plan.per_program)) / WARMUP)
-            self.state, metrics = self.updates(
-                self.state, self.pool.arrays, np.int32(len(self.pool)), rates.astype(np.float32)
-            )
-            done += plan.per_program
-            if decoder is None:
-                decoder, decoder_first = self._ready("decoder"), share
-            if decoder is not None and len(self.frames):
-                part = (share - decoder_first) / (1 - decoder_first)
-                for _ in range(max(1, plan.per_program // plan.decoder_every)):
-                    warm = min(1.0, 3 * (decoded + 1) / WARMUP)
-                    rate = plan.decoder_rate * schedule(part) * warm
-                    self.decoder_state, others = decoder(
-                        self.decoder_state,
-                        self.frozen,
-                        self.frames.arrays,
-                        np.int32(len(self.frames)),
-                        np.float32(plan.generated if refreshed else 0),
-                        np.float32(rate),
-                    )
-                    decoded += 1
-                metrics = {**metrics, **{f"decoder_{k}": v for k, v in others.items()}}
+            if len(self.frames) == min(plan.frames, 8 * CHUNK) or self.decoded:
+                for line in self.decode.consider(partial(self._trial, self._decode, share)):
+                    self._say(step=self.done, form=line)
+                for _ in range(self._decoder_updates()):
+                    others = self._decode(self.decode.program, share, generated=refreshed > 0)
+                    metrics = {**metrics, **{f"decoder_{k}": v for k, v in others.items()}}
             pending.append(metrics)
             if len(pending) > 2:
                 jax.block_until_ready(pending[-3]["loss"])  # two programs wait on the device
             self._admit(clips, limit=2)
-            now = self.seconds
-            generate = self._ready("generate")
-            if decoder and generate and share > 1 / 3 and now - refreshed > 30:
+            now, generate = self.seconds, self._ready("generate")
+            if self.decoded and generate and share > 1 / 3 and now - refreshed > 30:
                 self._refresh(generate)
                 refreshed = now
             if now - logged > plan.log_s:
+                paces = [
+                    (n - m) / (now - logged)
+                    for n, m in zip((self.done, self.decoded), counted, strict=True)
+                ]
                 self._say(
                     **means(pending),
-                    step=done,
+                    step=self.done,
                     rate=rate,
                     clips=self.pool.appended,
                     queue=clips.chunks.qsize(),
-                    updates_per_s=(done - before) / (now - logged),
-                    decoder_per_s=(decoded - decoded_before) / (now - logged),
+                    updates_per_s=paces[0],
+                    decoder_per_s=paces[1],
                 )
-                pending, logged, before, decoded_before = pending[-2:], now, done, decoded
+                pending, logged, counted = pending[-2:], now, (self.done, self.decoded)
             if now - validated > plan.validate_s:
                 validated = now
-                self._say(step=done, validation=self.validate(clips.held))
+                self._say(step=self.done, validation=self.validate(clips.held))
             if now - saved > plan.save_s:
                 saved = now
                 self.save()
-        self._say(step=done, decoder_step=decoded, skipped=int(self.state.skipped))
+        self._say(step=self.done, decoder_step=self.decoded, skipped=int(self.state.skipped))
+
+    def _update(self, program: Any, share: float) -> Mapping[str, jax.Array]:
+        """Run a program of the denoiser's updates."""
+        plan = self.plan
+        steps = self.done + 1 + np.arange(plan.per_program)
+        rates = plan.learning_rate * schedule(share) * np.minimum(1, steps / WARMUP)
+        rows = np.int32(len(self.pool))
+        self.state, metrics = program(self.state, self.pool.arrays, rows, rates.astype(np.float32))
+        self.done += plan.per_program
+        return metrics
+
+    def _decode(
+        self, program: Any, share: float, generated: bool = False
+    ) -> Mapping[str, jax.Array]:
+        """Run an update of the decoder."""
+        plan = self.plan
+        if self.decoder_first is None:
+            self.decoder_first = share
+        part = (share - self.decoder_first) / (1 - self.decoder_first)
+        warm = min(1.0, 3 * (self.decoded + 1) / WARMUP)
+        self.decoder_state, metrics = program(
+            self.decoder_state,
+            self.frozen,
+            self.frames.arrays,
+            np.int32(len(self.frames)),
+            np.float32(plan.generated if generated else 0),
+            np.float32(plan.decoder_rate * schedule(part) * warm),
+        )
+        self.decoded += 1
+        return metrics
+
+    def _trial(self, run: Callable[..., Any], share: float, program: Any) -> float:
+        """Return the seconds of a program: four runs, the first not counted.
+
+        They are updates of the run. A program that fails has infinite seconds and changes nothing.
+        """
+        before = jax.tree.map(jnp.copy, (self.state, self.decoder_state)), self.done, self.decoded
+        try:
+            jax.block_until_ready(run(program, share))
+            began = time.monotonic()
+            for _ in range(3):
+                metrics = run(program, share)
+            jax.block_until_ready(metrics)
+        except jax.errors.JaxRuntimeError as problem:
+            self._say(step=self.done, failed=str(problem)[:200])
+            (self.state, self.decoder_state), self.done, self.decoded = before
+            return math.inf
+        return (time.monotonic() - began) / 3
+
+    def _decoder_updates(self) -> int:
+        """Return the number of decoder updates beside one program of the denoiser's."""
+        if self.decode.program is None:
+            return 0
+        ratio = self.plan.decoder_share / (1 - self.plan.decoder_share)
+        return max(1, round(ratio * self.updates.seconds / self.decode.seconds))
 
     def _share(self, first: float, done: int) -> float:
         """Return the share of the run that has passed, of its time or of its updates."""

@@ -138,6 +138,7 @@ def main(args: Sequence[str] | None = None) -> None:
     parser.add_argument("--held-out", type=int, default=0, help="scenes of validation, made first")
     options = parser.parse_args(args)
     scenes = EndlessScenes(model=configs.get(options.config))
+    os.nice(10)  # the training process comes first
     make(
         scenes,
         options.queue,
