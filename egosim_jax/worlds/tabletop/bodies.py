@@ -169,6 +169,10 @@ def split_edges(
     for vertex, around in enumerate(np.split(corners, np.cumsum(counts)[:-1])):
         found = normals[around // 3]
         near = found @ found.T > np.cos(np.radians(50))
+        if near.all():  # as at most vertices of round bodies
+            faces.flat[around] = len(points)
+            points.append(vertices[vertex])
+            continue
         left = np.ones(len(around), bool)
         while left.any():
             group = np.zeros_like(left)
