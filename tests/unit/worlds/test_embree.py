@@ -76,7 +76,7 @@ def test_a_clip_by_embreex_is_that_of_open3d(seed, monkeypatch):
     for name in ("target", "prior", "first_frame"):
         pixels = getattr(triplet, name).astype(int)
         off = np.abs(getattr(other_triplet, name) - pixels).max(axis=-1)
-        assert (off > 0).sum() <= 3  # a point may be drawn into the pixel beside
+        assert (off > 0).sum() <= 3  # a point may fall into another pixel
         assert name == "prior" or off.max() <= 1
 
 
