@@ -60,10 +60,10 @@ def pixel_rays(
     intrinsics_px: Float[np.ndarray, "3 3"], *, height: int, width: int
 ) -> Float[np.ndarray, "h w 3"]:
     """Return the ray of each pixel in camera coordinates, with z = 1; ray x depth is a point."""
-    rows, columns = np.mgrid[:height, :width].astype(np.float64)
-    x = (columns - intrinsics_px[0, 2]) / intrinsics_px[0, 0]
-    y = (rows - intrinsics_px[1, 2]) / intrinsics_px[1, 1]
-    return np.stack([x, y, np.ones_like(x)], axis=-1)
+    rays = np.ones((height, width, 3))
+    rays[..., 0] = (np.arange(width) - intrinsics_px[0, 2]) / intrinsics_px[0, 0]
+    rays[..., 1] = ((np.arange(height) - intrinsics_px[1, 2]) / intrinsics_px[1, 1])[:, None]
+    return rays
 
 
 def upsample_intrinsics(

@@ -26,6 +26,7 @@ from egosim_jax.rendering.skeleton import (
 )
 from egosim_jax.types import Cameras, InputError, Kind, SceneState, View
 
+_CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T > 0
 NO_POINT = np.iinfo(np.uint64).max
 """Key of a pixel that sees no point."""
 GAP_MARGIN_PX = 2
@@ -50,16 +51,13 @@ def splat(
         u, v = project(focal, local)
         # One key for depth and number: the bits of positive floats sort as the floats do.
         keys = local[:, 2].copy().view(np.uint32).astype(np.uint64) << 32 | number
-        order = np.argsort(keys)[::-1]  # the last write to a cell wins: the nearest point
-        column, row = (np.ceil(x[order] - point_px / 2).astype(int) for x in (u, v))
-        keys, best = keys[order], np.full(shape[1] * shape[2], NO_POINT)
+        column, row = (np.ceil(x - point_px / 2).astype(int) for x in (u, v))
+        best = np.full(shape[1] * shape[2], NO_POINT)
         for down in range(point_px):
             for right in range(point_px):
                 y, x = row + down, column + right
                 inside = (y >= 0) & (y < shape[1]) & (x >= 0) & (x < shape[2])
-                seen = np.full_like(best, NO_POINT)
-                seen[y[inside] * shape[2] + x[inside]] = keys[inside]
-                best = np.minimum(best, seen)
+                np.minimum.at(best, y[inside] * shape[2] + x[inside], keys[inside])
         best = best.reshape(shape[1:])
         drawn = best != NO_POINT
         depth[frame][drawn] = (best[drawn] >> 32).astype(np.uint32).view(np.float32)
@@ -204,8 +202,7 @@ def _window(
     low, high = np.minimum(start, end) - radius, np.maximum(start, end) + radius
     if low[2] < NEAR_M:  # corners behind the camera cannot be projected; `_meet` clips
         return slice(0, cameras.height), slice(0, cameras.width)
-    corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
-    u, v = project(cameras.intrinsics_px, corners)
+    u, v = project(cameras.intrinsics_px, np.where(_CORNERS, high, low))
     return (
         slice(max(0, int(np.floor(v.min()))), max(0, int(np.ceil(v.max())) + 1)),
         slice(max(0, int(np.floor(u.min()))), max(0, int(np.ceil(u.max())) + 1)),

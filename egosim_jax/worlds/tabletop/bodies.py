@@ -164,18 +164,24 @@ def split_edges(
     normals = np.cross(b - a, c - a)
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]
     points, faces = [], triangles.copy()
-    for vertex in range(len(vertices)):
-        left = [tuple(corner) for corner in np.argwhere(triangles == vertex)]
-        while left:
-            group = [left.pop()]
-            for corner in group:
-                near = [
-                    o for o in left if normals[o[0]] @ normals[corner[0]] > np.cos(np.radians(50))
-                ]
-                group += near
-                left = [other for other in left if other not in near]
-            for face, corner in group:
-                faces[face, corner] = len(points)
+    corners = np.argsort(triangles, axis=None, kind="stable")
+    counts = np.bincount(triangles.ravel(), minlength=len(vertices))
+    for vertex, around in enumerate(np.split(corners, np.cumsum(counts)[:-1])):
+        found = normals[around // 3]
+        near = found @ found.T > np.cos(np.radians(50))
+        if near.all():  # as at most vertices of round bodies
+            faces.flat[around] = len(points)
+            points.append(vertices[vertex])
+            continue
+        left = np.ones(len(around), bool)
+        while left.any():
+            group = np.zeros_like(left)
+            reached = np.arange(len(left)) == np.flatnonzero(left)[-1]
+            while reached.any():
+                group |= reached
+                left &= ~reached
+                reached = left & near[reached].any(axis=0)
+            faces.flat[around[group]] = len(points)
             points.append(vertices[vertex])
     return np.array(points), faces
 
