@@ -139,6 +139,9 @@ def main(args: Sequence[str] | None = None) -> None:
     options = parser.parse_args(args)
     scenes = EndlessScenes(model=configs.get(options.config))
     os.nice(10)  # the training process comes first
+    cores = sorted(os.sched_getaffinity(0))
+    if options.stride + 2 <= len(cores):  # Embree would start more threads than one each
+        os.sched_setaffinity(0, {cores[2 + options.first % options.stride]})
     make(
         scenes,
         options.queue,
