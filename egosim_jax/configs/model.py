@@ -71,7 +71,9 @@ class ModelConfig:
     layout: ChannelLayout = field(default_factory=ChannelLayout)
     """Input channels of the denoiser."""
     point_px: int = POINT_PX
-    """Side of the points of a rendered prior in pixels, in training and in generation."""
+    """Side of the points of a rendered prior in pixels, in training and in generation.
+
+    Gaps between points of one pixel are closed."""
     tokenizer: PromptTokenizer = field(default_factory=PromptTokenizer)
     """Tokenizer of the prompts."""
     encoders: Literal["frozen", "joint"] = "frozen"

@@ -128,7 +128,7 @@ def close_gaps(
 
     A gap is a pixel that sees no point but is in the morphological closing, by a square of 3 x 3
     pixels, of the pixels that see one: wider unobserved areas keep their shape. It sees the
-    farthest of the points around it, since what is missing next to an edge is behind the edge; at
+    farthest of the points around it, because next to an edge the surface behind is incomplete; at
     equal depth, the first.
     """
     import cv2
