@@ -384,7 +384,7 @@ class OnlineRun:
                 self._say(step=self.done, form=line)
             metrics = self._update(self.updates.program, share)
             rate = plan.learning_rate * schedule(share)
-            if len(self.frames) == min(plan.frames, 8 * CHUNK) or self.decoded:
+            if len(self.frames) >= min(plan.frames, 8 * CHUNK):
                 for line in self.decode.consider(partial(self._trial, self._decode, share)):
                     self._say(step=self.done, form=line)
                 for _ in range(self._decoder_updates()):
