@@ -373,7 +373,7 @@ class OnlineRun:
 
     def _loop(self, clips: Clips) -> None:
         plan = self.plan
-        self.tasks["updates"].result()
+        self._await_updates()
         first = logged = validated = saved = self.seconds
         refreshed, rate, counted = 0.0, 0.0, (0, 0)
         self.done = self.decoded = 0
@@ -420,6 +420,15 @@ class OnlineRun:
                 saved = now
                 self.save()
         self._say(step=self.done, decoder_step=self.decoded, skipped=int(self.state.skipped))
+
+    def _await_updates(self) -> None:
+        """Wait until a form of the denoiser's updates is compiled. Raises if none can be."""
+        while not any(
+            task.done() and not task.exception() for task in self.updates.waiting.values()
+        ):
+            if all(task.done() for task in self.updates.waiting.values()):
+                self.tasks["updates"].result()
+            time.sleep(0.1)
 
     def _update(self, program: Any, share: float) -> Mapping[str, jax.Array]:
         """Run a program of the denoiser's updates."""
