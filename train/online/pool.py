@@ -1,8 +1,8 @@
 """Pools of clips on the accelerator, from which updates draw.
 
-`LatentPool` has the denoiser's examples, with all latents. `FramePool` has the decoder's: the newest
-clips' frames, their latents, and the latents that the denoiser generates for them. A full pool
-forgets its oldest clips. Every clip is encoded once, in the training process.
+One pool has the denoiser's examples, with all latents. Another has the decoder's: the newest clips'
+frames, their latents, and the latents that the denoiser generates for them. A full pool forgets its
+oldest clips. Every clip is encoded once, in the training process.
 """
 
 from __future__ import annotations

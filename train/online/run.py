@@ -9,33 +9,26 @@ the end.
 from __future__ import annotations
 
 import math
-import os
 import queue
-import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
-from functools import partial
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from egosim_jax.conditioning.condition import ConditionDropout
-from egosim_jax.configs.model import ModelConfig, Networks
-from egosim_jax.diffusion.objective import Objective
+from egosim_jax.configs.model import Networks
 from egosim_jax.io import parts, weights
-from egosim_jax.models.attention import Kernel
 from egosim_jax.train.deepen import deepen_weights
 from egosim_jax.train.metric_writers import JsonLines
+from egosim_jax.train.online.arrivals import Clips, stacked, start_workers
 from egosim_jax.train.online.latents import read_latents
+from egosim_jax.train.online.plan import OnlineTraining
 from egosim_jax.train.online.pool import (
     CHUNK,
     Pool,
@@ -44,7 +37,6 @@ from egosim_jax.train.online.pool import (
     raw_shapes,
     videos_of,
 )
-from egosim_jax.train.online.scenes import HELD_OUT, queued
 from egosim_jax.train.online.updates import (
     Updater,
     make_decoder_update,
@@ -52,156 +44,9 @@ from egosim_jax.train.online.updates import (
     make_generate,
     make_judge,
 )
-from egosim_jax.train.tasks.denoising import Denoising
-from egosim_jax.train.tasks.refining import Refining
 
 WARMUP = 300
 """Updates of linear warm-up of the denoiser; the decoder has a third."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class OnlineTraining:
-    """Settings of an online training."""
-
-    model: ModelConfig
-    """Model to train."""
-    start: Path
-    """Folder of the weights to start from; a shallower denoiser is deepened."""
-    out: Path
-    """Folder of the run."""
-    minutes: float | None = None
-    """Duration, compilation included; None: by `updates`."""
-    updates: int | None = None
-    """Number of the denoiser's updates; the run ends at the first of both limits."""
-    workers: int = 0
-    """Number of processes that make scenes; 0: train on the given latents only."""
-    first_scene: int = 2_000_000
-    """Seed of the first scene."""
-    held_out: int = 48
-    """Number of validation scenes, of the seeds from 0."""
-    latents: Path | None = None
-    """Folder of latents made beforehand, which may still grow (`latents.py`)."""
-    batch: int = 128
-    """Clips of a denoiser's update."""
-    per_program: int = 8
-    """Updates of the denoiser in one program."""
-    learning_rate: float = 1.2e-3
-    """Peak learning rate of the denoiser."""
-    weight_decay: float = 0.05
-    """Its weight decay."""
-    ema_decay: float = 0.9995
-    """Decay of its moving average."""
-    decoder_share: float = 0.25
-    """Share of the device's time for the decoder; 0: the decoder stays."""
-    decoder_batch: int = 6
-    """Clips of a decoder's update."""
-    decoder_rate: float = 1e-3
-    """Peak learning rate of the decoder."""
-    decoder_ema: float = 0.998
-    """Decay of its moving average."""
-    generated: float = 0.5
-    """Fraction of the decoder's latents that the denoiser generated, from a third of the run on."""
-    clips: int = 12288
-    """Capacity of the pool of latents."""
-    frames: int = 3072
-    """Capacity of the pool of frames."""
-    seed: int = 0
-    """Seed of the batches and the noise."""
-    log_s: float = 10.0
-    """Seconds between log lines."""
-    validate_s: float = 75.0
-    """Seconds between validations."""
-    save_s: float = 120.0
-    """Seconds between writings of the weights."""
-    kernels: tuple[Kernel, ...] = ("auto",)
-    """Attention kernels to try, the likely fastest first."""
-    compiler: Mapping[str, Any] = field(default_factory=dict)
-    """Options of the compiler that save time for convolutions; the default ones are tried too."""
-    graphs: Mapping[str, Any] = field(default_factory=dict)
-    """Options of the compiler to try for the denoiser, with the first kernel."""
-
-    @property
-    def denoising(self) -> Denoising:
-        """Task of the denoiser."""
-        dropout = ConditionDropout(prior=0.05, mask=0.05, hands=0.05, text=0.05)
-        steps = self.model.steps
-        return Denoising(
-            model=self.model,
-            objective=Objective(sampler_steps=steps if isinstance(steps, int) else None),
-            dropout=dropout,
-            change_loss_weight=4.0,
-        )
-
-    @property
-    def refining(self) -> Refining:
-        """Task of the decoder."""
-        return Refining(
-            vae=self.model.vae,
-            video=self.model.video,
-            crop=(self.model.video.height, self.model.video.width),
-            part="decoder",
-            motion_weight=4.0,
-        )
-
-
-class Choice:
-    """Forms of one program: the first that is compiled runs, until a faster one is ready."""
-
-    def __init__(self, forms: Mapping[str, Future[Any]]):
-        self.waiting = dict(forms)
-        self.label, self.seconds = "", math.inf
-        self.program: Any = None
-
-    def consider(self, trial: Callable[[Any], float]) -> list[str]:
-        """Take the fastest of the forms that are compiled; return a line for each new one.
-
-        `trial` runs a program and returns its seconds; it runs the present one again, too.
-        """
-        ready = [label for label, task in self.waiting.items() if task.done()]
-        lines = []
-        for label in ready:
-            task = self.waiting.pop(label)
-            if problem := task.exception():
-                lines.append(f"{label}: {type(problem).__name__}: {str(problem)[:200]}")
-                continue
-            if self.program is not None:
-                self.seconds = trial(self.program)
-            seconds = trial(task.result())
-            lines.append(f"{label}: {1e3 * seconds:.1f} ms, {self.label}: {1e3 * self.seconds:.1f}")
-            if seconds < self.seconds:
-                self.label, self.seconds, self.program = label, seconds, task.result()
-        return lines
-
-
-class Clips(threading.Thread):
-    """Reader of the queue: chunks of raw clips, and the held-out ones."""
-
-    def __init__(self, folder: Path):
-        super().__init__(daemon=True)
-        self.folder, self.chunks = folder, queue.Queue(maxsize=4)
-        self.held: list[Mapping[str, np.ndarray]] = []
-
-    def run(self) -> None:
-        """Read files as they appear."""
-        rows: list[Mapping[str, np.ndarray]] = []
-        while self.folder.is_dir():
-            for path in queued(self.folder):
-                with np.load(path) as file:
-                    row = dict(file)
-                path.unlink()
-                if path.name.startswith(HELD_OUT):
-                    self.held.append(row)
-                    continue
-                rows.append(row)
-                if len(rows) == CHUNK:
-                    self.chunks.put(stacked(rows))
-                    rows = []
-            time.sleep(0.1)
-
-
-def stacked(rows: list[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Return rows as one array each."""
-    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 
 
 class OnlineRun:
@@ -249,7 +94,7 @@ class OnlineRun:
     def train(self) -> None:
         """Train until the end, and write the weights."""
         plan = self.plan
-        with TemporaryDirectory(dir=shared_memory()) as folder:
+        with TemporaryDirectory(dir=plan.out) as folder:
             clips, processes = Clips(Path(folder)), []
             try:
                 processes = start_workers(plan, Path(folder))
@@ -261,95 +106,64 @@ class OnlineRun:
                 for process in processes:
                     process.kill()
         self.save()
-        self._say(validation=self.validate(clips.held), done=True)
+        self._say(step=self.done, validation=self.validate(clips.held))
 
     def _compile(self) -> None:
         """Compile the programs side by side; those that no update needs may come later."""
         plan, state, decoder, rows = self.plan, self.state, self.decoder_state, np.int32(1)
         one, pool, frames = np.float32(1), self.pool.arrays, self.frames.arrays
-        raw = raw_shapes(plan.model, CHUNK)
-        latents = latent_shapes(plan.model, CHUNK)
-        for name in videos_of(plan.model):
+        raw, latents = raw_shapes(plan.model, CHUNK), latent_shapes(plan.model, CHUNK)
+        for name in (*videos_of(plan.model), "pixels"):
             latents[name] = jax.ShapeDtypeStruct(latents[name].shape, np.float32)
-        latents["pixels"] = raw["pixels"]
-        update = make_decoder_update(
-            plan.refining, self.decoder, self.vae_graph, batch=plan.decoder_batch, seed=plan.seed
-        )
-        generate = make_generate(plan.model, self.graph, batch=self.chunk)
-        judge = make_judge(plan.denoising, self.graph, self.vae_graph, CHUNK)
-        encode = make_encode(plan.model, nnx.merge(self.vae_graph, decoder.params, self.frozen).vae)
-        rates = np.zeros(plan.per_program, np.float32)
-        first, *others = plan.kernels
-        forms = {"updates": (first, {})}
-        if plan.graphs:
-            forms["updates, graphs"] = (first, plan.graphs)
-        forms |= {f"updates, {kernel}": (kernel, {}) for kernel in others}
-        denoisers = {
-            name: (self._updates(kernel), options, state, pool, rows, rates)
-            for name, (kernel, options) in forms.items()
-        }
-        arguments = (decoder, self.frozen, frames, rows, one, one)
-        calls: dict[str, tuple] = {
-            "encode": (encode, plan.compiler, self.vae, raw),
-            "decoder": (update, plan.compiler, *arguments),
-            "generate": (
-                generate, {}, state.average, pool, frames["row"], frames["generated"], rows, rows,
-            ),
-            "judge": (
-                judge, plan.compiler, state.average, decoder.average, self.frozen, latents,
-                raw["target"],
-            ),
-        }  # fmt: skip
-        if plan.compiler:
-            calls["decoder, searched"] = (update, {}, *arguments)
-        if not plan.decoder_share:
-            calls = {name: calls[name] for name in ("encode", "judge")}
-        # Two at a time, in order: what is needed first is not slowed down by what can wait.
-        self.tasks = {}
-        for group in (denoisers, calls):
-            executor = ThreadPoolExecutor(1)
-            for name, call in group.items():
-                self.tasks[name] = executor.submit(self._compiled, name, *call)
-            executor.shutdown(wait=False)
-        self.updates = Choice({name: self.tasks[name] for name in denoisers})
-        self.decode = Choice({n: task for n, task in self.tasks.items() if "decoder" in n})
-        self.encode = self.tasks["encode"].result()
-
-    def _updates(self, kernel: Kernel) -> Any:
-        """Return the denoiser's jitted updates with an attention kernel."""
-        plan = self.plan
-        model = replace(plan.model, dit=replace(plan.model.dit, attention=kernel))
-        only = model.trained_networks
-        networks = nnx.eval_shape(lambda: Networks.build(model, only=only, rngs=nnx.Rngs(0)))
-        return make_denoiser_updates(
-            replace(plan, model=model).denoising,
+        updates = make_denoiser_updates(
+            plan.denoising,
             self.denoiser,
-            nnx.graphdef(networks),
+            self.graph,
             batch=plan.batch,
             count=plan.per_program,
             seed=plan.seed,
         )
+        update = make_decoder_update(
+            plan.refining, self.decoder, self.vae_graph, batch=plan.decoder_batch, seed=plan.seed
+        )
+        encode = make_encode(plan.model, nnx.merge(self.vae_graph, decoder.params, self.frozen).vae)
+        generate = make_generate(plan.model, self.graph, batch=self.chunk)
+        judge = make_judge(plan.denoising, self.graph, self.vae_graph, CHUNK)
+        rates = np.zeros(plan.per_program, np.float32)
+        calls: dict[str, tuple] = {
+            "updates": (updates, state, pool, rows, rates),
+            "encode": (encode, self.vae, raw),
+            "decoder": (update, decoder, self.frozen, frames, rows, one, one),
+            "generate": (
+                generate, state.average, pool, frames["row"], frames["generated"], rows, rows,
+            ),
+            "judge": (
+                judge, state.average, decoder.average, self.frozen, latents, raw["target"],
+            ),
+        }  # fmt: skip
+        if not plan.decoder_share:
+            del calls["decoder"], calls["generate"]
+        executor = ThreadPoolExecutor(2)  # in order: what is needed first does not wait
+        self.tasks = {
+            name: executor.submit(self._compiled, name, *call) for name, call in calls.items()
+        }
+        executor.shutdown(wait=False)
+        self.updates, self.encode = (self.tasks[name].result() for name in ("updates", "encode"))
 
-    def _compiled(self, name: str, jitted: Any, options: Mapping[str, Any], *args: Any) -> Any:
+    def _compiled(self, name: str, jitted: Any, *args: Any) -> Any:
         shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), args)
-        program = jitted.lower(*shapes).compile(compiler_options=dict(options) or None)
+        program = jitted.lower(*shapes).compile()
         self._say(compiled=name)
         return program
 
     def _ready(self, name: str) -> Any:
-        """Return a program, or None while it is being compiled or if it cannot be."""
+        """Return a program, or None while it is being compiled."""
         task = self.tasks.get(name)
-        if task is None or not task.done():
-            return None
-        if problem := task.exception():
-            self._say(failed=name, problem=str(problem)[:200])
-            del self.tasks[name]
-            return None
-        return task.result()
+        return task.result() if task is not None and task.done() else None
 
     def _wait_for_clips(self, clips: Clips) -> None:
         self._admit(clips, limit=10**6)
-        while len(self.pool) < min(4 * CHUNK, self.plan.clips):
+        while len(self.pool) < min(self.plan.first_clips, self.plan.clips):
             time.sleep(0.2)
             self._admit(clips, limit=8)
 
@@ -373,22 +187,18 @@ class OnlineRun:
 
     def _loop(self, clips: Clips) -> None:
         plan = self.plan
-        self._await_updates()
         first = logged = validated = saved = self.seconds
         refreshed, rate, counted = 0.0, 0.0, (0, 0)
         self.done = self.decoded = 0
         self.decoder_first: float | None = None
+        self.pace: int | None = None
         pending: list[Mapping[str, jax.Array]] = []
         while (share := self._share(first, self.done)) < 1:
-            for line in self.updates.consider(partial(self._trial, self._update, share)):
-                self._say(step=self.done, form=line)
-            metrics = self._update(self.updates.program, share)
+            metrics = self._update(share)
             rate = plan.learning_rate * schedule(share)
-            if len(self.frames) >= min(plan.frames, 8 * CHUNK):
-                for line in self.decode.consider(partial(self._trial, self._decode, share)):
-                    self._say(step=self.done, form=line)
-                for _ in range(self._decoder_updates()):
-                    others = self._decode(self.decode.program, share, generated=refreshed > 0)
+            if self._ready("decoder") and len(self.frames) >= min(plan.frames, 8 * CHUNK):
+                for _ in range(self._decoder_updates(share)):
+                    others = self._decode(share, generated=refreshed > 0)
                     metrics = {**metrics, **{f"decoder_{k}": v for k, v in others.items()}}
             pending.append(metrics)
             if len(pending) > 2:
@@ -421,35 +231,26 @@ class OnlineRun:
                 self.save()
         self._say(step=self.done, decoder_step=self.decoded, skipped=int(self.state.skipped))
 
-    def _await_updates(self) -> None:
-        """Wait until a form of the denoiser's updates is compiled. Raises if none can be."""
-        while not any(
-            task.done() and not task.exception() for task in self.updates.waiting.values()
-        ):
-            if all(task.done() for task in self.updates.waiting.values()):
-                self.tasks["updates"].result()
-            time.sleep(0.1)
-
-    def _update(self, program: Any, share: float) -> Mapping[str, jax.Array]:
+    def _update(self, share: float) -> Mapping[str, jax.Array]:
         """Run a program of the denoiser's updates."""
         plan = self.plan
         steps = self.done + 1 + np.arange(plan.per_program)
         rates = plan.learning_rate * schedule(share) * np.minimum(1, steps / WARMUP)
         rows = np.int32(len(self.pool))
-        self.state, metrics = program(self.state, self.pool.arrays, rows, rates.astype(np.float32))
+        self.state, metrics = self.updates(
+            self.state, self.pool.arrays, rows, rates.astype(np.float32)
+        )
         self.done += plan.per_program
         return metrics
 
-    def _decode(
-        self, program: Any, share: float, generated: bool = False
-    ) -> Mapping[str, jax.Array]:
+    def _decode(self, share: float, *, generated: bool = False) -> Mapping[str, jax.Array]:
         """Run an update of the decoder."""
         plan = self.plan
         if self.decoder_first is None:
             self.decoder_first = share
         part = (share - self.decoder_first) / (1 - self.decoder_first)
         warm = min(1.0, 3 * (self.decoded + 1) / WARMUP)
-        self.decoder_state, metrics = program(
+        self.decoder_state, metrics = self._ready("decoder")(
             self.decoder_state,
             self.frozen,
             self.frames.arrays,
@@ -460,30 +261,14 @@ class OnlineRun:
         self.decoded += 1
         return metrics
 
-    def _trial(self, run: Callable[..., Any], share: float, program: Any) -> float:
-        """Return the seconds of a program: four runs, the first not counted.
-
-        They are updates of the run. A program that fails has infinite seconds and changes nothing.
-        """
-        before = jax.tree.map(jnp.copy, (self.state, self.decoder_state)), self.done, self.decoded
-        try:
-            jax.block_until_ready(run(program, share))
-            began = time.monotonic()
-            for _ in range(3):
-                metrics = run(program, share)
-            jax.block_until_ready(metrics)
-        except jax.errors.JaxRuntimeError as problem:
-            self._say(step=self.done, failed=str(problem)[:200])
-            (self.state, self.decoder_state), self.done, self.decoded = before
-            return math.inf
-        return (time.monotonic() - began) / 3
-
-    def _decoder_updates(self) -> int:
+    def _decoder_updates(self, share: float) -> int:
         """Return the number of decoder updates beside one program of the denoiser's."""
-        if self.decode.program is None:
-            return 0
-        ratio = self.plan.decoder_share / (1 - self.plan.decoder_share)
-        return max(1, round(ratio * self.updates.seconds / self.decode.seconds))
+        if self.pace is None:  # both are timed once
+            seconds = [_seconds(run, share) for run in (self._update, self._decode)]
+            ratio = self.plan.decoder_share / (1 - self.plan.decoder_share)
+            self.pace = max(1, round(ratio * seconds[0] / seconds[1]))
+            self._say(step=self.done, program_s=seconds[0], decoder_s=seconds[1])
+        return self.pace
 
     def _share(self, first: float, done: int) -> float:
         """Return the share of the run that has passed, of its time or of its updates."""
@@ -540,13 +325,17 @@ class OnlineRun:
             files = sorted(Path(folder).glob("*.safetensors"))
             parts.cut(files, self.plan.out / "weights")
 
-    def _say(self, *, validation: Mapping[str, float] | None = None, **values: Any) -> None:
-        values = {**values, **{f"validation_{n}": v for n, v in (validation or {}).items()}}
-        step = values.pop("step", int(values.pop("done", 0)))
-        numbers = "  ".join(
+    def _say(
+        self, *, step: int = 0, validation: Mapping[str, float] | None = None, **values: Any
+    ) -> None:
+        """Print values, and log those that are numbers."""
+        values |= {f"validation_{name}": value for name, value in (validation or {}).items()}
+        numbers = {n: float(v) for n, v in values.items() if isinstance(v, int | float)}
+        self.log.write(step, {"seconds": self.seconds, **numbers})
+        line = "  ".join(
             f"{n} {v:.4g}" if isinstance(v, float) else f"{n} {v}" for n, v in values.items()
         )
-        print(f"{self.seconds:7.1f} s  step {step:>6}  {numbers}", file=sys.stderr, flush=True)
+        print(f"{self.seconds:7.1f} s  step {step:>6}  {line}", file=sys.stderr, flush=True)
 
 
 def schedule(share: float) -> float:
@@ -563,22 +352,11 @@ def means(rows: list[Mapping[str, jax.Array]]) -> dict[str, float]:
     return {name: float(np.mean(values)) for name, values in found.items()}
 
 
-def start_workers(plan: OnlineTraining, folder: Path) -> list[subprocess.Popen]:
-    """Start the processes that make scenes, first the held-out ones."""
-    threads = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu", **dict.fromkeys(threads, "1")}
-    command = [sys.executable, "-m", "egosim_jax.train.online.scenes"]
-    command += ["--config", plan.model.name, "--queue", str(folder)]
-    command += ["--stride", str(plan.workers), "--held-out", str(plan.held_out), "--first"]
-    log = (plan.out / "scenes.log").open("a")
-    return [
-        subprocess.Popen(
-            [*command, str(plan.first_scene + number)], env=environment, stderr=log, stdout=log
-        )
-        for number in range(plan.workers)
-    ]
-
-
-def shared_memory() -> str | None:
-    """Return a folder in memory, or None where there is none."""
-    return "/dev/shm" if Path("/dev/shm").is_dir() else None
+def _seconds(run: Callable[[float], Any], share: float) -> float:
+    """Return the seconds of one of the run's calls: four are made, the first is not counted."""
+    jax.block_until_ready(run(share))
+    began = time.monotonic()
+    for _ in range(3):
+        metrics = run(share)
+    jax.block_until_ready(metrics)
+    return (time.monotonic() - began) / 3

@@ -1,0 +1,193 @@
+"""Online training: its scenes, its pools, its latents made beforehand, and its updates."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from flax import nnx
+from optax.contrib import MuonDimensionNumbers, muon
+
+from egosim_jax import configs
+from egosim_jax.configs.model import Networks
+from egosim_jax.diffusion.objective import Objective
+from egosim_jax.diffusion.process import RectifiedFlow
+from egosim_jax.io import weights
+from egosim_jax.models import abstract
+from egosim_jax.train.config import OptimizerConfig, make_optimizer
+from egosim_jax.train.deepen import deepen_weights
+from egosim_jax.train.online.latents import read_latents, write_shard
+from egosim_jax.train.online.plan import OnlineTraining
+from egosim_jax.train.online.pool import CHUNK, Pool, latent_shapes, raw_shapes
+from egosim_jax.train.online.run import OnlineRun, schedule
+from egosim_jax.train.online.scenes import EndlessScenes, queued, row_of, write_row
+from egosim_jax.types import InputError
+from egosim_jax.worlds.tabletop.idle import REACH_M, make_idle, wander
+
+DEBUG = configs.get("debug")
+
+
+def rows_of(count, seed=0):
+    draw = np.random.default_rng(seed)
+    return {
+        name: draw.normal(size=s.shape).astype(s.dtype)
+        if np.issubdtype(s.dtype, np.floating)
+        else draw.integers(0, 2, s.shape).astype(s.dtype)
+        for name, s in latent_shapes(DEBUG, count).items()
+    }
+
+
+def test_a_seed_gives_the_same_clips_and_every_kind_of_scene_occurs(tmp_path):
+    scenes = EndlessScenes(model=DEBUG, clips=1, attempts=0.0, idle=0.5)
+    first, second = ([next(scenes.clips_of(seed)) for seed in range(6)] for _ in range(2))
+    for one, other in zip(first, second, strict=True):
+        np.testing.assert_array_equal(one.frames, other.frames)
+    assert {clip.verb == "execute" for clip in first} == {True, False}
+    assert {clip.kind for clip in first} == {"human", "robot"}
+    row = row_of(next(scenes.triplets(3)), DEBUG)
+    assert {name: (array.shape, array.dtype) for name, array in row.items()} == {
+        name: (s.shape[1:], s.dtype) for name, s in raw_shapes(DEBUG, 1).items()
+    }
+    write_row(tmp_path, "3_0", row)
+    (path,) = queued(tmp_path)
+    np.testing.assert_array_equal(np.load(path)["target"], row["target"])
+
+
+def test_idle_hands_rest_are_absent_or_wander():
+    kinds = set()
+    for seed in range(12):
+        (clip,) = make_idle(seed, spec=DEBUG.video)
+        joints = clip.joints_m[:, 0]
+        kinds.add(
+            "absent" if np.isnan(joints).all() else float(np.ptp(joints[:, 0], axis=0).max()) > 0
+        )
+    assert kinds == {"absent", True, False}
+    path = wander(200, np.random.default_rng(0))
+    assert np.abs(path).max() <= REACH_M
+    assert (path[0] == 0).all()
+
+
+def test_latents_of_eight_bits_are_read_to_one_in_220_of_their_range(tmp_path):
+    rows, read = rows_of(2 * CHUNK), set()
+    write_shard(tmp_path / "a.npz", rows)
+    found = list(read_latents(tmp_path, read, DEBUG, limit=5))
+    assert len(found) == 2
+    assert not list(read_latents(tmp_path, read, DEBUG, limit=5))
+    for name, array in rows.items():
+        got = np.concatenate([chunk[name] for chunk in found]).astype(np.float32)
+        exact = not np.issubdtype(array.dtype, np.floating)
+        bound = 0 if exact else np.abs(array).max() / 220
+        np.testing.assert_allclose(got, array.astype(np.float32), atol=bound, rtol=0)
+
+
+def test_a_full_pool_forgets_its_oldest_clips():
+    pool = Pool(latent_shapes(DEBUG, 2 * CHUNK))
+    for seed in range(3):
+        pool.append(rows_of(CHUNK, seed))
+    assert len(pool) == 2 * CHUNK
+    np.testing.assert_array_equal(pool.arrays["ids"][:CHUNK], rows_of(CHUNK, 2)["ids"])
+    np.testing.assert_array_equal(pool.arrays["ids"][CHUNK:], rows_of(CHUNK, 1)["ids"])
+    with pytest.raises(ValueError, match="multiple of 16"):
+        Pool(latent_shapes(DEBUG, CHUNK + 1))
+
+
+@pytest.mark.parametrize("layers", [3, 4])
+def test_a_deeper_denoiser_computes_the_same(tmp_path, layers):
+    networks = Networks.random(DEBUG, seed=0)
+    networks.save(tmp_path / "two")
+    folder = deepen_weights(tmp_path / "two", layers, tmp_path / "deep")
+    deep = abstract(replace(DEBUG.dit, layers=layers))
+    weights.load(folder / "dit.safetensors", deep)
+    draw = np.random.default_rng(0)
+    shapes = ((1, 3, 4, 4, 52), (1, 5, DEBUG.dit.text_dim), (1, 5, DEBUG.dit.image_dim))
+    latents, text, image = (jnp.asarray(draw.normal(size=s), jnp.float32) for s in shapes)
+    inputs = latents, jnp.array([500.0]), text, image
+    expected, found = networks.dit(*inputs), deep(*inputs)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert (folder / "vae.safetensors").exists()
+    assert deepen_weights(tmp_path / "two", 2, tmp_path / "same") == tmp_path / "two"
+    with pytest.raises(InputError, match="2 to 4 blocks, not to 5"):
+        deepen_weights(tmp_path / "two", 5, tmp_path / "more")
+
+
+def test_grouped_muon_equals_muon_of_each_weight():
+    networks = Networks.random(DEBUG, seed=0)
+    params = nnx.state((networks.dit, networks.text, networks.image), nnx.Param)
+    draw = np.random.default_rng(0)
+    gradients = jax.tree.map(lambda x: jnp.asarray(draw.normal(size=x.shape), jnp.float32), params)
+    config = OptimizerConfig(name="muon", learning_rate=1e-2, weight_decay=0.05)
+
+    def axes(leaf):
+        """Return the axes of a matrix `[layers?, ..., in, out]`; embeddings are not matrices."""
+        names = leaf.get_metadata().get("axes", ())
+        layers = int(names[:1] == ("layers",))
+        if isinstance(leaf.get_value(), optax.MaskedNode) or "vocab" in names:
+            return None
+        rank = len(leaf.shape)
+        return (
+            None
+            if rank - layers < 2
+            else MuonDimensionNumbers((*range(layers, rank - 1),), rank - 1)
+        )
+
+    variables = lambda leaf: isinstance(leaf, nnx.Variable)  # noqa: E731
+    single = optax.chain(
+        optax.clip_by_global_norm(1.0),
+        muon(
+            1e-2,
+            weight_decay=0.05,
+            consistent_rms=0.2,
+            muon_weight_dimension_numbers=lambda tree: jax.tree.map(
+                lambda leaf: leaf.replace(axes(leaf)), tree, is_leaf=variables
+            ),
+        ),
+    )
+    updates = []
+    for optimizer in (single, make_optimizer(config, 10)):
+        found, state = optimizer.update(gradients, optimizer.init(params), params)
+        found, _ = optimizer.update(gradients, state, params)
+        updates.append(jax.tree.leaves(found))
+    for one, other in zip(*updates, strict=True):
+        np.testing.assert_allclose(other, one, atol=1e-6)
+
+
+def test_half_of_the_times_are_those_of_the_sampler():
+    process = RectifiedFlow(shift=3.0)
+    times = Objective(sampler_steps=2).sample_times(process, jax.random.key(0), 4000)
+    shares = [float(np.isclose(times, visited).mean()) for visited in (1.0, 0.75)]
+    np.testing.assert_allclose(shares, 0.25, atol=0.03)
+    uniform = Objective().sample_times(process, jax.random.key(1), 4000)
+    others = times[~np.isclose(times, 1.0) & ~np.isclose(times, 0.75)]
+    assert abs(float(others.mean() - uniform.mean())) < 0.03
+    with pytest.raises(InputError, match="sampler_steps"):
+        Objective(times="diffsynth", sampler_steps=2)
+
+
+def test_the_schedule_falls_to_a_hundredth():
+    assert [schedule(share) for share in (0.0, 0.5, 1.0)] == pytest.approx([1, 0.5, 0.01])
+
+
+@pytest.mark.slow
+def test_a_run_is_the_same_in_programs_of_one_and_of_two_updates(tmp_path):
+    Networks.random(DEBUG, seed=0).save(tmp_path / "start")
+    (tmp_path / "latents").mkdir()
+    write_shard(tmp_path / "latents" / "a.npz", rows_of(2 * CHUNK))
+    model = replace(DEBUG, dit=replace(DEBUG.dit, layers=3))
+
+    def train(out, per_program):
+        plan = OnlineTraining(
+            model=model, start=tmp_path / "start", out=tmp_path / out, updates=4, workers=0,
+            latents=tmp_path / "latents", batch=2, per_program=per_program, decoder_share=0.0,
+            first_clips=CHUNK, clips=2 * CHUNK, frames=CHUNK,
+        )  # fmt: skip
+        run = OnlineRun(plan)
+        run.train()
+        return run
+
+    one, two = train("one", 1), train("two", 2)
+    assert int(one.state.step) == int(two.state.step) == 4
+    for a, b in zip(*(jax.tree.leaves(run.state.params) for run in (one, two)), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5)
+    assert (tmp_path / "one" / "weights" / "parts.json").exists()

@@ -1,0 +1,95 @@
+"""Settings of an online training."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from egosim_jax.conditioning.condition import ConditionDropout
+from egosim_jax.configs.model import ModelConfig
+from egosim_jax.diffusion.objective import Objective
+from egosim_jax.train.tasks.denoising import Denoising
+from egosim_jax.train.tasks.refining import Refining
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnlineTraining:
+    """Settings of an online training."""
+
+    model: ModelConfig
+    """Model to train."""
+    start: Path
+    """Folder of the weights to start from; a shallower denoiser is deepened."""
+    out: Path
+    """Folder of the run."""
+    minutes: float | None = None
+    """Duration, compilation included; None: by `updates`."""
+    updates: int | None = None
+    """Number of the denoiser's updates; the run ends at the first of both limits."""
+    workers: int = 14
+    """Number of processes that make scenes; 0: train on the given latents only."""
+    first_scene: int = 2_000_000
+    """Seed of the first scene."""
+    held_out: int = 48
+    """Number of validation scenes, of the seeds from 0."""
+    latents: Path | None = None
+    """Folder of latents made beforehand, which may still grow (`latents.py`)."""
+    batch: int = 128
+    """Clips of a denoiser's update."""
+    per_program: int = 8
+    """Updates of the denoiser in one program."""
+    learning_rate: float = 1.2e-3
+    """Peak learning rate of the denoiser."""
+    weight_decay: float = 0.05
+    """Its weight decay."""
+    ema_decay: float = 0.9995
+    """Decay of its moving average."""
+    decoder_share: float = 0.25
+    """Share of the device's time for the decoder; 0: the decoder stays."""
+    decoder_batch: int = 6
+    """Clips of a decoder's update."""
+    decoder_rate: float = 1e-3
+    """Peak learning rate of the decoder."""
+    decoder_ema: float = 0.998
+    """Decay of its moving average."""
+    generated: float = 0.5
+    """Fraction of the decoder's latents that the denoiser generated, from a third of the run on."""
+    first_clips: int = 64
+    """Clips that must be there before the first update.
+
+    A denoiser that begins with few clips learns them by heart and does not recover in minutes."""
+    clips: int = 12288
+    """Capacity of the pool of latents."""
+    frames: int = 3072
+    """Capacity of the pool of frames."""
+    seed: int = 0
+    """Seed of the batches and the noise."""
+    log_s: float = 10.0
+    """Seconds between log lines."""
+    validate_s: float = 75.0
+    """Seconds between validations."""
+    save_s: float = 120.0
+    """Seconds between writings of the weights."""
+
+    @property
+    def denoising(self) -> Denoising:
+        """Task of the denoiser."""
+        dropout = ConditionDropout(prior=0.05, mask=0.05, hands=0.05, text=0.05)
+        steps = self.model.steps
+        return Denoising(
+            model=self.model,
+            objective=Objective(sampler_steps=steps if isinstance(steps, int) else None),
+            dropout=dropout,
+            change_loss_weight=4.0,
+        )
+
+    @property
+    def refining(self) -> Refining:
+        """Task of the decoder."""
+        return Refining(
+            vae=self.model.vae,
+            video=self.model.video,
+            crop=(self.model.video.height, self.model.video.width),
+            part="decoder",
+            motion_weight=4.0,
+        )
