@@ -47,7 +47,7 @@ def grouped(
 ) -> optax.GradientTransformation:
     """Return `inner` on the groups of a tree of nnx variables.
 
-    `dimensions` tells which leaves are matrices `[n?, ..., in, out]`. The state of `inner` has the
+    `dimensions` returns the axes of a matrix `[n?, ..., in, out]`, else None. The state of `inner`
     groups' shapes and is replicated on a mesh.
     """
 

@@ -29,8 +29,8 @@ from flax import nnx
 from egosim_jax import configs
 from egosim_jax.configs.model import Networks
 from egosim_jax.models import attention
-from egosim_jax.train.online.pool import Pool, latent_shapes, raw_shapes
 from egosim_jax.train.online.plan import OnlineTraining
+from egosim_jax.train.online.pool import Pool, latent_shapes, raw_shapes
 from egosim_jax.train.online.updates import Updater, make_decoder_update, make_denoiser_updates
 
 LOOPS = {

@@ -143,7 +143,7 @@ class OnlineRun:
         }  # fmt: skip
         if not plan.decoder_share:
             del calls["decoder"], calls["generate"]
-        executor = ThreadPoolExecutor(2)  # in order: what is needed first does not wait
+        executor = ThreadPoolExecutor(2)  # in order: the programs needed first do not wait
         self.tasks = {
             name: executor.submit(self._compiled, name, *call) for name, call in calls.items()
         }
@@ -262,7 +262,7 @@ class OnlineRun:
         return metrics
 
     def _decoder_updates(self, share: float) -> int:
-        """Return the number of decoder updates beside one program of the denoiser's."""
+        """Return the number of decoder updates next to one program of the denoiser's."""
         if self.pace is None:  # both are timed once
             seconds = [_seconds(run, share) for run in (self._update, self._decode)]
             ratio = self.plan.decoder_share / (1 - self.plan.decoder_share)
@@ -280,7 +280,7 @@ class OnlineRun:
         return max(shares)
 
     def _refresh(self, generate: Any) -> None:
-        """Generate the latents of the frame pool anew."""
+        """Generate the latents of the frame pool again."""
         frames, seed = self.frames.arrays, np.int32(self.seconds)
         for start in range(0, len(self.frames), self.chunk):
             frames["generated"] = generate(

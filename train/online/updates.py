@@ -159,7 +159,7 @@ def make_decoder_update(
 
 
 def make_generate(model: ModelConfig, graph: nnx.GraphDef, *, batch: int) -> Any:
-    """Return the jitted function that generates the latents of part of a frame pool anew.
+    """Return the jitted function that generates the latents of part of a frame pool again.
 
     It takes the denoiser's weights, the arrays of the pool of latents, the frame pool's `row` and
     `generated`, the first of `batch` rows, and a seed; it returns `generated`.

@@ -1,6 +1,6 @@
 """Clips in which the wearer does nothing in particular, executed by the true world.
 
-The hands rest, are absent, or wander as those of an untrained policy do, under any prompt. In a
+The hands rest, are absent, or wander as under an untrained policy, under any prompt. In a
 script a hand always reaches for a body. A model trained only on scripts lets a resting hand melt.
 """
 
