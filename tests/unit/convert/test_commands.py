@@ -28,7 +28,6 @@ from egosim_jax.convert.detect import detect
 from egosim_jax.convert.tables import table_of
 from egosim_jax.diffusion import DDIM, RectifiedFlow, VariancePreserving
 from egosim_jax.io.weights import flat_shapes, hashes
-from egosim_jax.testing import write_weights
 from egosim_jax.types import InputError
 from tests.translation import translate_back
 
@@ -355,13 +354,12 @@ def test_what_is_not_of_the_config_is_not_written_back(tmp_path, capsys):
     [(VariancePreserving(), "no VariancePreserving"), (RectifiedFlow(prediction="x0"), "x0")],
 )
 def test_a_process_without_a_scheduler_is_refused_before_writing(
-    tmp_path, monkeypatch, process, reason
+    debug_weights, tmp_path, monkeypatch, process, reason
 ):
-    write_weights(tmp_path / "ours", CONFIG)
     changed = replace(CONFIG, process=process, solver=DDIM())
     monkeypatch.setattr(configs, "get", lambda name: changed)
     command = commands.ToTorch(
-        weights=tmp_path / "ours", config="debug", out=tmp_path / "out", layout="diffusers"
+        weights=debug_weights, config="debug", out=tmp_path / "out", layout="diffusers"
     )
     with pytest.raises(InputError, match=reason):
         command.run()
