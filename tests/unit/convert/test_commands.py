@@ -320,6 +320,7 @@ def test_folders_of_the_encoders_alone_are_converted_and_written_back(tmp_path):
 
 
 @pytest.mark.parametrize("layout", ["wan", "diffusers"])
+@pytest.mark.parametrize("checkpoint", ["EgoSim", "diffusers"], indirect=True)
 def test_there_and_back_every_tensor_is_the_same(checkpoint, tmp_path, layout, monkeypatch):
     monkeypatch.setattr(writer, "MAX_FILE_BYTES", 200_000)  # bytes, so that there is more than one
     assert convert(checkpoint, tmp_path / "ours") == 0
@@ -366,6 +367,7 @@ def test_a_process_without_a_scheduler_is_refused_before_writing(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("checkpoint", ["EgoSim", "diffusers"], indirect=True)
 def test_a_forward_of_each_network_is_that_of_pytorch(checkpoint, tmp_path, capsys):
     assert convert(checkpoint, tmp_path) == 0
     assert main(["verify", str(checkpoint), str(tmp_path), "--config", "debug"]) == 0
