@@ -5,6 +5,8 @@ import re
 from importlib.util import find_spec
 from pathlib import Path
 
+import pytest
+
 from tests.flags import QUICK
 
 os.environ.setdefault("XLA_FLAGS", QUICK)
@@ -20,3 +22,12 @@ def pytest_ignore_collect(collection_path: Path) -> bool | None:
     if find_spec("torch") is None and collection_path.suffix == ".py":
         return NEEDS_TORCH.search(collection_path.read_text()) is not None or None
     return None
+
+
+@pytest.fixture(scope="session")
+def debug_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Random weights of `debug`, which no test changes."""
+    from egosim_jax import configs
+    from egosim_jax.testing import write_weights
+
+    return write_weights(tmp_path_factory.mktemp("debug"), configs.get("debug"))

@@ -12,6 +12,7 @@ from typing import no_type_check
 
 import numpy as np
 from av.video.frame import VideoFrame
+from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
 from jaxtyping import Float
 
@@ -129,7 +130,7 @@ def _decode(
     each: Callable[[np.ndarray], np.ndarray] | None,
 ) -> np.ndarray:
     """Decode the frames with increasing time stamps, starting at a key frame."""
-    kept, before = FrameBuffer(name), None
+    kept, before, scaler = FrameBuffer(name), None, VideoReformatter()
     with open_video(file, name, None) as stream:
         for decoded in _frames(stream, name, key[1]):
             stamp = stamps[0] - 1 if decoded.pts is None else decoded.pts
@@ -141,7 +142,7 @@ def _decode(
             before, frame = stamp, None
             while len(kept) < len(stamps) and stamps[len(kept)] == stamp:
                 if frame is None:
-                    frame = to_rgb(stream, decoded, "accurate")
+                    frame = to_rgb(stream, decoded, "accurate", scaler)
                     frame = frame if each is None else each(frame)
                 kept.append(frame)
             if len(kept) == len(stamps):

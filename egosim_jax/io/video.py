@@ -21,6 +21,7 @@ from typing import Any, no_type_check
 
 import av
 import numpy as np
+from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
@@ -204,7 +205,7 @@ def _decode(
     damage: Damage,
     each: Callable[[np.ndarray], np.ndarray] | None,
 ) -> Video:
-    kept, before, position = FrameBuffer(name), None, -1
+    kept, before, position, scaler = FrameBuffer(name), None, -1, VideoReformatter()
     with open_video(file, name, max_frames) as stream:
         # Damage after the wanted frames does not matter, so decoding finds it.
         listing = list_frames(stream, name, max_frames, damage="stop")
@@ -224,7 +225,7 @@ def _decode(
                 frame = None
                 while len(kept) < len(wanted) and wanted[len(kept)] == position:
                     if frame is None:
-                        frame = to_rgb(stream, decoded, decoding)
+                        frame = to_rgb(stream, decoded, decoding, scaler)
                         frame = frame if each is None else each(frame)
                     kept.append(frame)
                 if len(kept) == len(wanted) and stop < timeline.count:

@@ -4,15 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from egosim_jax import configs
-from egosim_jax.testing import write_weights
-
 
 @pytest.fixture(scope="session")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def weights(debug_weights: Path) -> Path:
     """Random weights of `debug`."""
-    folder = tmp_path_factory.mktemp("weights")
-    return write_weights(folder, configs.get("debug"))
+    return debug_weights
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -99,17 +99,10 @@ def test_training_listens_on_the_loopback_alone(tmp_path, count):
     assert found <= LOOPBACK
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        ["simulate", "--clips", "1"],
-        ["generate", "--config", "debug"],
-        ["data", "make", "tabletop", "--scenes", "2"],
-    ],
-    ids=lambda options: options[0],
-)
-def test_commands_listen_nowhere(tmp_path, options):
-    command = [sys.executable, "-m", "egosim_jax.cli", *options, "--out", str(tmp_path / "out")]
+def test_the_workers_of_a_command_listen_nowhere(tmp_path):
+    """`test_secrets.py` has other commands."""
+    options = ["data", "make", "tabletop", "--scenes", "2", "--out", str(tmp_path / "out")]
+    command = [sys.executable, "-m", "egosim_jax.cli", *options]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     assert seen_while([subprocess.Popen(command, cwd=ROOT, **quiet)]) == set()
 

@@ -16,7 +16,7 @@ from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.generation.generator import Generator
 from egosim_jax.io import parts
 from egosim_jax.runtime.command import ExitCode
-from egosim_jax.testing import write_latents, write_weights
+from egosim_jax.testing import write_latents
 from egosim_jax.train import bundle_writer
 from egosim_jax.train.bundle import FILES, LATENTS, BundleRecipe, Latents, main
 from egosim_jax.train.bundle_writer import write_bundle
@@ -71,15 +71,10 @@ def latents(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def weights(tmp_path_factory):
-    return write_weights(tmp_path_factory.mktemp("weights"), MODEL)
-
-
-@pytest.fixture(scope="module")
-def written(latents, weights, tmp_path_factory):
+def written(latents, debug_weights, tmp_path_factory):
     out = tmp_path_factory.mktemp("bundle") / "bundle"
     data = {"train": latents, "test": latents}
-    write_bundle(out, STAGE, latents=data, weights=weights, dtype="float16")
+    write_bundle(out, STAGE, latents=data, weights=debug_weights, dtype="float16")
     return out
 
 
@@ -104,9 +99,9 @@ def losses(out: Path) -> list[float]:
 
 @pytest.mark.slow
 def test_the_losses_are_those_of_the_trainer_on_the_same_batches(
-    trained, latents, weights, tmp_path
+    trained, latents, debug_weights, tmp_path
 ):
-    train(*STAGE, data=latents, validation=None, out=tmp_path / "run", weights=weights)
+    train(*STAGE, data=latents, validation=None, out=tmp_path / "run", weights=debug_weights)
     expected = losses(tmp_path / "run")
     assert len(expected) == STEPS
     assert losses(trained) == expected
@@ -178,11 +173,13 @@ def test_each_epoch_has_every_record_once_in_another_order(written, monkeypatch,
     np.testing.assert_array_equal(data.batch(4, size=2, seed=3)["record"], batches[4])
 
 
-def test_records_are_split_into_shards_of_limited_size(latents, weights, tmp_path, monkeypatch):
+def test_records_are_split_into_shards_of_limited_size(
+    latents, debug_weights, tmp_path, monkeypatch
+):
     record = sum(array.nbytes for array in ShardReader(latents)[0].arrays.values())
     monkeypatch.setattr(bundle_writer, "SHARD_BYTES", bundle_writer.HEADER_BYTES + record)
     data = {"train": latents, "test": latents}
-    write_bundle(tmp_path / "b", STAGE, latents=data, weights=weights, dtype="float16")
+    write_bundle(tmp_path / "b", STAGE, latents=data, weights=debug_weights, dtype="float16")
     shards = sorted(path.name for path in (tmp_path / "b" / LATENTS).glob("train-*"))
     assert len(shards) > 2
     assert len(Latents(tmp_path / "b", "train")) == 5
@@ -207,7 +204,7 @@ def test_every_file_has_its_hash_and_no_code_is_missing(written):
 
 
 @pytest.mark.slow
-def test_a_recipe_writes_its_clips_and_weights_into_a_bundle(weights, tmp_path):
+def test_a_recipe_writes_its_clips_and_weights_into_a_bundle(debug_weights, tmp_path):
     out = tmp_path / "b"
     recipe = replace(
         TABLETOP,
@@ -215,7 +212,7 @@ def test_a_recipe_writes_its_clips_and_weights_into_a_bundle(weights, tmp_path):
         denoiser=STAGE.training,
         scenes=2,
         held_out=1,
-        weights=weights,
+        weights=debug_weights,
         bundle=out,
     )
     assert recipe.train() == ExitCode.DONE

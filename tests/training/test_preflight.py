@@ -109,12 +109,18 @@ def test_an_option_of_the_report_is_refused_by_a_training(option, capsys):
     assert f"{option} has no effect without --preflight" in capsys.readouterr().err
 
 
-@pytest.fixture
-def room(monkeypatch):
-    """Compile nothing: the test says which settings fit, and gets the tried ones."""
+@pytest.fixture(scope="module")
+def compiled():
+    """A stage with a batch of 8, this processor, and the report of the compiled update."""
     stage, target = recipes.DEBUG.stages()["denoiser"], targets.find("cpu:1")
     stage = stage._replace(training=replace(stage.training, batch_size=8))
-    measured = module.compile_step(stage, target)
+    return stage, target, module.compile_step(stage, target)
+
+
+@pytest.fixture
+def room(compiled, monkeypatch):
+    """Compile nothing: the test says which settings fit, and gets the tried ones."""
+    stage, target, measured = compiled
 
     def look(fits):
         tried = []

@@ -3,7 +3,7 @@
 import json
 import shutil
 from fractions import Fraction
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import pyarrow as pa
@@ -176,25 +176,41 @@ PATHS = {
 }
 
 
-@pytest.mark.parametrize("reader", READERS)
-@pytest.mark.parametrize("film", FILMS)
-def test_a_frame_is_the_one_of_its_time(film, reader, tmp_path):
-    write, expected = FILMS[film]
-    write(tmp_path / "film.mp4")
-    dataset = READERS[reader](tmp_path / "set", tmp_path / "film.mp4", len(expected))
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """Return a function that writes a film once and gives its path."""
+    folder = tmp_path_factory.mktemp("films")
+
+    @cache
+    def write(film):
+        path = folder / f"{film}.mp4".replace(" ", "_")
+        FILMS[film][0](path)
+        return path
+
+    return write
+
+
+def pairs(names, thorough):
+    """Return every film with some names, and every name with two films."""
+    few = ("missing frame", "edit list")
+    return [(film, name) for film in FILMS for name in names if name in thorough or film in few]
+
+
+@pytest.mark.parametrize(("film", "reader"), pairs(READERS, ("lerobot v3.0", "egosim")))
+def test_a_frame_is_the_one_of_its_time(film, reader, written, tmp_path):
+    _, expected = FILMS[film]
+    dataset = READERS[reader](tmp_path / "set", written(film), len(expected))
     (recording,), problems = imported(dataset, tmp_path / "out")
     assert not problems
     assert recording.fps == FPS
     assert numbers(recording.read_frames().frames) == expected
 
 
-@pytest.mark.parametrize("path", PATHS)
-@pytest.mark.parametrize("film", FILMS)
-def test_every_path_takes_the_same_frames(film, path, tmp_path):
-    write, expected = FILMS[film]
-    write(tmp_path / "film.mp4")
+@pytest.mark.parametrize(("film", "path"), pairs(PATHS, ("segments", "video")))
+def test_every_path_takes_the_same_frames(film, path, written, tmp_path):
+    _, expected = FILMS[film]
     step = 3 if path == "pack by rate" else 1  # 30 to 8 fps
-    found = numbers(PATHS[path](tmp_path, tmp_path / "film.mp4"))
+    found = numbers(PATHS[path](tmp_path, written(film)))
     wanted = expected[::step][: len(found)]
     assert found == wanted + wanted[-1:] * (len(found) - len(wanted))
 
@@ -222,8 +238,13 @@ def test_a_clip_of_variable_rate_is_not_packed(tmp_path):
     assert "variable frame rate" in problem
 
 
-@pytest.mark.parametrize("rows", [FRAMES - 1, FRAMES + 1, FRAMES - 7, FRAMES + 9])
-@pytest.mark.parametrize("reader", [name for name in READERS if name != "taste_rob"])
+@pytest.mark.parametrize(
+    ("reader", "rows"),
+    [
+        *((name, FRAMES + n) for name in READERS if name != "taste_rob" for n in (-7, 1)),
+        *((name, FRAMES + n) for name in ("lerobot v3.0", "egovid") for n in (-1, 9)),
+    ],
+)
 def test_of_different_lengths_what_fits_is_used(reader, rows, tmp_path, caplog):
     film = write_film(tmp_path / "film.mp4")
     (recording,), problems = imported(READERS[reader](tmp_path / "set", film, rows), tmp_path / "o")

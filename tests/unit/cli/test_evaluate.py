@@ -27,14 +27,18 @@ def run(clips, tmp_path):
     return folder
 
 
-@pytest.fixture(autouse=True)
-def network(monkeypatch):
+@pytest.fixture(scope="module")
+def network():
     """Return a small LPIPS network, because test programs are compiled without optimization."""
     stage = (lpips.Convolution(features=4),)
     alex = dataclasses.replace(lpips.CONFIGS["alex"], stages=(stage,) * 5)
-    found = lpips.Lpips(alex, rngs=nnx.Rngs(0))
-    monkeypatch.setattr(lpips, "load_if_installed", lambda name: found)
-    return found
+    return lpips.Lpips(alex, rngs=nnx.Rngs(0))
+
+
+@pytest.fixture(autouse=True)
+def installed(network, monkeypatch):
+    """Let commands find the network."""
+    monkeypatch.setattr(lpips, "load_if_installed", lambda name: network)
 
 
 def target_of(clips, name):

@@ -14,16 +14,14 @@ from egosim_jax.data.metadata import read_metadata
 from egosim_jax.data.windows import conditions_sha256, windows_of
 from egosim_jax.generation.batch import BatchJob
 from egosim_jax.runtime.command import ExitCode
-from egosim_jax.testing import write_weights
 from egosim_jax.types import InputError, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 
 
-def test_a_lora_of_other_weights_is_refused(tmp_path, capsys):
-    write_weights(tmp_path / "weights", configs.get("debug"))
+def test_a_lora_of_other_weights_is_refused(debug_weights, tmp_path, capsys):
     adapter = tmp_path / "lora.safetensors"
     save_file({"a": np.zeros(3, np.float32)}, adapter, metadata={"base_sha256": "5" * 64})
-    options = ["--weights", str(tmp_path / "weights"), "--lora", str(adapter)]
+    options = ["--weights", str(debug_weights), "--lora", str(adapter)]
     code = main(["generate", "--config", "debug", "--out", str(tmp_path / "out"), *options])
     assert code == ExitCode.USAGE
     assert "was trained on other weights" in capsys.readouterr().err
@@ -35,14 +33,13 @@ def test_the_strength_of_no_lora_is_refused(tmp_path, capsys):
     assert "--lora-scale is the strength of a LoRA" in " ".join(capsys.readouterr().err.split())
 
 
-def test_a_job_is_of_all_files_of_its_lora(tmp_path):
-    write_weights(tmp_path / "weights", configs.get("debug"))
+def test_a_job_is_of_all_files_of_its_lora(debug_weights, tmp_path):
     (tmp_path / "lora").mkdir()
     files = [tmp_path / "lora" / f"{stem}.safetensors" for stem in ("lora", "non_lora_weights")]
     for file in files:
         save_file({"a": np.zeros(3, np.float32)}, file)
     job = BatchJob(
-        model=configs.get("debug"), out=tmp_path / "out", weights=tmp_path / "weights",
+        model=configs.get("debug"), out=tmp_path / "out", weights=debug_weights,
         lora=tmp_path / "lora",
     )  # fmt: skip
     job.open()

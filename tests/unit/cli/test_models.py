@@ -1,6 +1,7 @@
 """`egosim models`: from a release on a hub to loadable weights."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -15,26 +16,31 @@ from egosim_jax.convert.commands import ToTorch, Weights
 from egosim_jax.io import hub
 from egosim_jax.io.bounded import read_json
 from egosim_jax.runtime.command import ExitCode
-from egosim_jax.testing import write_weights
 from egosim_jax.types import InputError
 from tests.hub import COMMIT, Hub, serve
 
 FILES = configs.release("egosim_14b").files
 
 
-@pytest.fixture
-def served(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def published(debug_weights, tmp_path_factory):
     """A release of `debug` in the file layout of EgoSim-14B."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    ours, folder = tmp_path / "ours", tmp_path / "hub"
-    write_weights(ours, configs.get("debug"))
-    ToTorch(weights=ours, config="debug", out=folder).run()
+    folder = tmp_path_factory.mktemp("published") / "hub"
+    ToTorch(weights=debug_weights, config="debug", out=folder).run()
     for name in filter(lambda name: name.endswith(".pth"), FILES):
         written = (folder / name).with_suffix(".safetensors")
         torch.save(load_file(written), folder / name)
         written.unlink()
     (folder / "google" / "umt5-xxl").mkdir(parents=True)
     (folder / "google" / "umt5-xxl" / "tokenizer.json").write_text("{}")
+    return folder
+
+
+@pytest.fixture
+def served(published, tmp_path, monkeypatch):
+    """The release on a hub."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder = shutil.copytree(published, tmp_path / "hub")
     fields = {"about": "test", "config": "debug", "revision": None, "widen": None}
     released = tmp_path / "released.json"
     entry = {**fields, "repository": "someone/debug", "files": dict(FILES)}
@@ -44,11 +50,13 @@ def served(tmp_path, monkeypatch):
         yield running
 
 
-def test_fetched_weights_are_those_of_the_release_and_are_found_by_name(served, tmp_path, capsys):
+def test_fetched_weights_are_those_of_the_release_and_are_found_by_name(
+    served, debug_weights, capsys
+):
     assert main(["models", "fetch", "debug"]) == ExitCode.DONE
     folder = configs.weights_of("debug", None)
     assert capsys.readouterr().out.splitlines()[-1] == str(folder)
-    for file in sorted((tmp_path / "ours").glob("*.safetensors")):
+    for file in sorted(debug_weights.glob("*.safetensors")):
         expected, found = load_numpy(file), load_numpy(folder / file.name)
         assert found.keys() == expected.keys()
         assert all(np.array_equal(found[name], expected[name]) for name in expected)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import shlex
+import shutil
 
 import numpy as np
 import pytest
@@ -11,7 +12,6 @@ from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
 from egosim_jax.generation.generator import Generator
 from egosim_jax.io import weights
-from egosim_jax.testing import write_weights
 from egosim_jax.train import recipes
 from egosim_jax.types import InputError
 
@@ -83,8 +83,8 @@ def test_a_checkpoint_is_refused_by_the_library_and_by_training(tmp_path):
         recipe.train()
 
 
-def test_a_run_given_as_weights_is_named_with_its_folder(tmp_path):
-    write_weights(tmp_path / "run" / "weights", configs.get("debug"))
+def test_a_run_given_as_weights_is_named_with_its_folder(debug_weights, tmp_path):
+    shutil.copytree(debug_weights, tmp_path / "run" / "weights")
     with pytest.raises(InputError, match=r"run is a run: its weights are in .*run/weights\. \("):
         configs.weights_of("debug", tmp_path / "run")
     assert configs.weights_of("debug", tmp_path / "run" / "weights")

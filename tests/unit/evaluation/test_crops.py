@@ -62,9 +62,19 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("change", ["equal", "darker", "delayed", "one wrong clip"])
-def test_a_crop_is_found(kind, change):
+@pytest.mark.parametrize(
+    ("change", "kind"),
+    [
+        *(("equal", kind) for kind in KINDS),
+        ("darker", "center square"),
+        ("darker", "zoomed at the full size"),
+        ("delayed", "off center"),
+        ("delayed", "whole, letterboxed"),
+        ("one wrong clip", "center 16:10 with margins"),
+        ("one wrong clip", "squeezed by four percent"),
+    ],
+)
+def test_a_crop_is_found(change, kind):
     box, size = KINDS[kind]
     pairs = []
     for seed in range(3):

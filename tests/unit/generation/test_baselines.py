@@ -13,7 +13,6 @@ from egosim_jax.conditioning.condition import Condition
 from egosim_jax.diffusion import Euler, Guidance, RectifiedFlow
 from egosim_jax.generation.batch import STRENGTH, BatchJob
 from egosim_jax.generation.generator import Generator, denoise
-from egosim_jax.testing import write_weights
 from egosim_jax.types import InputError, Triplet
 from tests.parity.cogvideox_configs.dwm_tiny import CONFIG as DWM_TINY
 
@@ -61,9 +60,8 @@ def test_a_baseline_changes_the_conditions(triplet, tmp_path, baseline, without,
         assert recorder.hands.dtype == np.uint8
 
 
-def test_sdedit_begins_at_the_models_strength_or_its_default(tmp_path):
-    write_weights(tmp_path, configs.get("debug"))
-    command = Generate(config="debug", weights=tmp_path, baseline="sdedit")
+def test_sdedit_begins_at_the_models_strength_or_its_default(debug_weights):
+    command = Generate(config="debug", weights=debug_weights, baseline="sdedit")
     assert command._model().strength == STRENGTH
     assert replace(command, strength=0.5)._model().strength == 0.5
     assert replace(command, baseline="no_hands")._model().strength is None

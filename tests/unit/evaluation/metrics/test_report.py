@@ -50,7 +50,7 @@ COVERAGE = {
 }
 
 
-@pytest.mark.parametrize("count", [2, 3, 5, 8, 13, 24])
+@pytest.mark.parametrize("count", [3, 5, 24])
 @pytest.mark.parametrize("name", COVERAGE)
 def test_an_interval_has_the_true_mean_as_often_as_it_says(name, count):
     draw, least = COVERAGE[name]

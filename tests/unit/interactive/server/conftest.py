@@ -1,7 +1,9 @@
-"""Server shared by the tests of a module."""
+"""Server shared by the tests of a module, and a store of sessions."""
 
 import pytest
 
+from egosim_jax.interactive.server.store import Limits, Store
+from tests.painted import painted
 from tests.unit.interactive.server.served import run
 
 
@@ -10,3 +12,10 @@ def server(tmp_path_factory):
     service, port, _ = run(tmp_path_factory.mktemp("sessions"))
     yield service, port
     service.store.close()
+
+
+@pytest.fixture
+def store(tmp_path):
+    opened = Store(tmp_path / "sessions", painted(), Limits())
+    yield opened
+    opened.close()

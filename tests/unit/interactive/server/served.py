@@ -1,9 +1,11 @@
-"""Server in this process, reached over its sockets."""
+"""Server in this process, reached over its sockets, and steps of its sessions."""
 
 import json
 import threading
 import urllib.error
 import urllib.request
+
+import numpy as np
 
 from egosim_jax.interactive.server.server import bind, serve
 from egosim_jax.interactive.server.service import Service
@@ -42,3 +44,13 @@ def http(port, path, fields=None, method=None, **headers):
     except urllib.error.HTTPError as error:
         with error:
             return error.code, error.read()
+
+
+def rows(session, step=1):
+    return session.actions.rest + step * 0.02 * np.eye(7)[1][None]
+
+
+def step(store, session, number, actions=None):
+    actions = rows(session, number) if actions is None else actions
+    request = {"session": session.id, "step_id": number, "actions": actions}
+    return store.step(request).result()

@@ -10,9 +10,7 @@ import pytest
 from egosim_jax.interactive.server import store as store_module
 from egosim_jax.interactive.server.errors import RequestError, as_request_error
 from egosim_jax.interactive.server.session import Session
-from egosim_jax.interactive.server.store import Limits, Store
 from egosim_jax.io import atomic
-from tests.painted import painted
 from tests.unit.interactive.server.served import http, run
 
 
@@ -26,13 +24,6 @@ def fill(monkeypatch, after, code=errno.ENOSPC):
         real(path)
 
     monkeypatch.setattr(atomic, "sync", sync)
-
-
-@pytest.fixture
-def store(tmp_path):
-    opened = Store(tmp_path / "sessions", painted(), Limits())
-    yield opened
-    opened.close()
 
 
 def files(folder):
