@@ -13,14 +13,14 @@ BUSY = "import time\nwhile time.process_time() < {}: pass"
 
 
 def run_child(seconds):
-    subprocess.run([sys.executable, "-S", "-c", BUSY.format(seconds)], check=True)  # noqa: S603
+    subprocess.run([sys.executable, "-S", "-c", BUSY.format(seconds)], check=True)
 
 
 def run_open_child(seconds):
     """Spend the time in a child that still runs at the end, as the readers' does."""
     code = BUSY.format(seconds) + "\nprint(flush=True); input()"
     pipe = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    process = subprocess.Popen([sys.executable, "-S", "-c", code], **pipe)  # noqa: S603
+    process = subprocess.Popen([sys.executable, "-S", "-c", code], **pipe)
     assert process.stdout.readline()
     CHILDREN.append(process)
 
