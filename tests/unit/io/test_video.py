@@ -156,9 +156,9 @@ def test_every_error_of_ffmpeg_is_put_in_plain_words():
 
 
 def test_an_invalid_packet_is_named_in_plain_words():
-    data = bytearray(encode_video(smooth(), 16))
-    begin = data.index(b"mdat") + 4
-    data[begin : begin + 2000] = bytes(2000)
+    data = bytearray(encode_video(detailed(), 16))
+    begin = data.index(b"mdat") + 1800
+    data[begin : begin + 500] = bytes(500)
     with pytest.raises(DamagedError, match=r"damaged: its data are not valid\. Download or export"):
         decode_video(bytes(data))
 
