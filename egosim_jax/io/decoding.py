@@ -112,7 +112,7 @@ class DamagedError(InputError):
 
 
 def damaged(name: str, problem: str) -> DamagedError:
-    """Return the error for a damaged video: what is wrong, and what to do."""
+    """Return the error for a damaged video: the problem and the remedy."""
     return DamagedError(f"{name} is damaged: {problem}. Download or export it again.")
 
 
