@@ -19,10 +19,11 @@ def run_child(seconds):
 def run_open_child(seconds):
     """Spend the time in a child that still runs at the end, as the readers' does."""
     code = BUSY.format(seconds) + "\nprint(flush=True); input()"
-    pipe = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    process = subprocess.Popen([sys.executable, "-S", "-c", code], **pipe)
-    assert process.stdout.readline()
+    pipe = subprocess.PIPE
+    process = subprocess.Popen([sys.executable, "-S", "-c", code], stdin=pipe, stdout=pipe)
     CHILDREN.append(process)
+    assert process.stdout is not None
+    assert process.stdout.readline()
 
 
 def run_here(seconds):
