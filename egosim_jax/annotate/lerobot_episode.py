@@ -6,6 +6,7 @@ camera pose and intrinsics. Annotate a dataset that has only videos first (docs/
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ from egosim_jax.io.timing import Timeline, row_times
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.simulation.start import Start
 from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, SceneState, VideoSpec
+
+logger = logging.getLogger(__name__)
 
 MAX_HANDS = 2
 """Maximum number of hands in a dataset."""
@@ -53,6 +56,11 @@ def episode_from_lerobot(
     state, image = _scene(root / SCENE.format(number), state)
     joints, poses = _joints(rows[HANDS]), _numbers(rows[POSES], (4, 4), POSES)
     lens = _numbers(rows[INTRINSICS], (3, 3), INTRINSICS)
+    if _kind(joints.shape[2]) == "human" and len(poses) > 1 and (poses == poses[0]).all():
+        logger.warning(
+            "Episode %d of %s has the same camera pose in all frames: the camera is at rest, or "
+            "its poses are placeholders", number, quote_path(root),
+        )  # fmt: skip
     if not (lens == lens[0]).all():
         raise InputError(
             f"Episode {number} of {quote_path(root)} changes its {INTRINSICS}: an episode has one "

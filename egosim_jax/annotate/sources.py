@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from egosim_jax.data.clips import VIDEO_SUFFIXES
 from egosim_jax.data.recorded_files import DESCRIPTION, DepthFiles
 from egosim_jax.data.recording import Recording
@@ -87,13 +89,20 @@ def _with_depth(recording: Recording, folder: Path) -> Recording:
         stems = {f: f.stem.removeprefix("depth_") for f in own.glob(f"*{suffix}")}
         files = {int(stem): file for file, stem in stems.items() if stem.isdigit()}
         if files:
-            frames = range(recording.start, recording.start + recording.frames)
-            paths = tuple(files.get(frame) for frame in frames)
+            paths = tuple(files.get(frame) for frame in _frame_numbers(recording))
             return replace(recording, depth=DepthFiles(paths=paths, unit_m=unit_m))
     raise InputError(
         f"{quote_path(own)} has no depth maps: they are named 000000.png (16 bits, millimeters) or "
         "000000.npy (meters), by frame. (--depth)"
     )
+
+
+def _frame_numbers(recording: Recording) -> list[int]:
+    """Return the number in the video of each frame of a recording, from 0 at its constant rate."""
+    if recording.times_s is None:
+        return list(range(recording.start, recording.start + recording.frames))
+    fps = float(probe_long_video(recording.video).fps)
+    return np.floor(recording.times_s * fps + 0.5 + 1e-6).astype(int).tolist()
 
 
 def _inside(folder: Path) -> list[Path]:

@@ -219,6 +219,8 @@ def find_cameras(record: Record, estimators: Estimators, config: AnnotateConfig)
     if estimate.cameras is None:
         verdict = estimate.verdict
         raise RefusedError("cameras", f"cameras: {verdict.reason}", verdict.figures)
+    if f"{estimate.verdict.rung}_assumed_view_deg" in estimate.verdict.figures:
+        source = "assumed"
     return record.add("cameras", _camera_notes(estimate, source), estimate=estimate)
 
 

@@ -167,6 +167,15 @@ class Annotate:
             reasons = [video.get("problem"), *(about.get("reason") for about in clips)]
             for reason in dict.fromkeys(filter(None, reasons)):
                 print(printable(f"{name}: no clip: {reason}"), file=sys.stderr)
+        cameras = [about["cameras"] for about in report["annotations"] if about.get("cameras")]
+        assumed = [found for found in cameras if found["focal_source"] == "assumed"]
+        if assumed:
+            focal = assumed[0]["focal_px"]
+            print(
+                f"{len(assumed)} clips do not show their focal length: {focal:.0f} pixels of the "
+                "clip are assumed. Give it, in pixels of the video, if you know it. (--focal)",
+                file=sys.stderr,
+            )
         print(
             f"{counts['done']} clips done, {counts['refused']} refused, {counts['failed']} failed; "
             f"see {self.out / 'index.html'}",

@@ -16,7 +16,7 @@ from egosim_jax.evaluation.registration import (
     FRAMES,
     TRUE_FRAMES,
     WHOLE,
-    Crop,
+    Edges,
     Found,
     Pair,
     find_crop,
@@ -82,7 +82,7 @@ def _find(
         known = {**found.crop._asdict(), "correlation": found.correlation}
         cache.put(key, {**known, "found": float(found.found)})
         return found
-    crop = Crop(*(known[name] for name in Crop._fields))
+    crop = Edges(*(known[name] for name in Edges._fields))
     return Found(crop, known["correlation"], bool(known["found"]))
 
 

@@ -14,7 +14,7 @@ from egosim_jax.evaluation.metrics import lpips
 from egosim_jax.evaluation.metrics.dreamsim import DEFINITION, DreamSim
 from egosim_jax.evaluation.metrics.image import clip_psnr, color_drift, psnr, ssim
 from egosim_jax.evaluation.metrics.report import DEFINITIONS
-from egosim_jax.evaluation.registration import WHOLE, Crop
+from egosim_jax.evaluation.registration import WHOLE, Edges
 
 VERSION = 1
 """Version of all measures; a change invalidates cached scores."""
@@ -38,7 +38,7 @@ class GroundTruth:
     """First frame that is compared."""
     window: Window
     """Clip and window."""
-    crop: Crop = WHOLE
+    crop: Edges = WHOLE
     """Part of the recorded image that the frames show."""
 
     @property

@@ -21,7 +21,7 @@ from egosim_jax.data.clip_files import is_safe_id
 from egosim_jax.data.transforms import resize_image
 from egosim_jax.data.windows import Window
 from egosim_jax.evaluation.metrics.image import fit_colors
-from egosim_jax.evaluation.registration import WHOLE, Crop
+from egosim_jax.evaluation.registration import WHOLE, Edges
 from egosim_jax.io.bounded import quote_path, quote_text
 from egosim_jax.io.video import read_video
 from egosim_jax.types import InputError
@@ -41,7 +41,7 @@ class Shape(NamedTuple):
     frames: int
     height: int
     width: int
-    crop: Crop = WHOLE
+    crop: Edges = WHOLE
     """Part of the recorded image that is compared."""
 
     @property
@@ -92,7 +92,7 @@ class Folder:
     """True if clips may be missing."""
     seed_of: str | None = None
     """Method whose clips of one seed the folder has; scores are averaged over its seeds."""
-    crops: dict[str, Crop] = field(default_factory=dict)
+    crops: dict[str, Edges] = field(default_factory=dict)
     """Part of the recorded image that the clips show, by their ids; the whole by default."""
 
     @property
@@ -224,7 +224,7 @@ def check_names(methods: Sequence[Method]) -> None:
 
 
 def read_at(
-    path: Path, shape: Shape, start: int, *, border: bool = False, shown: Crop = WHOLE
+    path: Path, shape: Shape, start: int, *, border: bool = False, shown: Edges = WHOLE
 ) -> UInt8[np.ndarray, "f h w 3"]:
     """Read frames from `start`, fitted to a shape. Raises `InputError` if there are too few.
 
@@ -238,7 +238,7 @@ def read_at(
     return frames
 
 
-def _fit(frame: np.ndarray, *, shape: Shape, border: bool, shown: Crop) -> np.ndarray:
+def _fit(frame: np.ndarray, *, shape: Shape, border: bool, shown: Edges) -> np.ndarray:
     if border:
         frame = without_border(frame, *shape.whole)
     if shape.crop == shown:

@@ -35,43 +35,43 @@ _MIN_SHARE = 0.3
 """Minimum width of a crop in the search, as a share of the recorded width."""
 
 
-class Crop(NamedTuple):
-    """Part of an image, as edges in shares of its width and height."""
+class Edges(NamedTuple):
+    """Edges of a part of an image, in shares of its width and height."""
 
     left: float
     top: float
     right: float
     bottom: float
 
-    def common(self, other: Crop) -> Crop:
+    def common(self, other: Edges) -> Edges:
         """Return the intersection; it may be empty."""
-        return Crop(*map(max, self[:2], other[:2]), *map(min, self[2:], other[2:]))
+        return Edges(*map(max, self[:2], other[:2]), *map(min, self[2:], other[2:]))
 
-    def pixels(self, height: int, width: int) -> Crop:
+    def pixels(self, height: int, width: int) -> Edges:
         """Return the edges in pixels of an image."""
-        return Crop(*np.multiply(self, (width, height) * 2).tolist())
+        return Edges(*np.multiply(self, (width, height) * 2).tolist())
 
-    def whole_pixels(self, height: int, width: int) -> Crop:
+    def whole_pixels(self, height: int, width: int) -> Edges:
         """Return the largest crop inside that has whole pixels of an image."""
         edges = np.round(self.pixels(height, width), 2)
         inside = np.concatenate([np.ceil(edges[:2]), np.floor(edges[2:])])
-        return Crop(*(inside / ((width, height) * 2)).tolist())
+        return Edges(*(inside / ((width, height) * 2)).tolist())
 
-    def within(self, other: Crop) -> Crop:
+    def within(self, other: Edges) -> Edges:
         """Return this crop in shares of the crop `other`."""
         left, top, right, bottom = other
         size = np.array([right - left, bottom - top] * 2)
-        return Crop(*((np.array(self) - [left, top, left, top]) / size).tolist())
+        return Edges(*((np.array(self) - [left, top, left, top]) / size).tolist())
 
 
-WHOLE = Crop(0.0, 0.0, 1.0, 1.0)
+WHOLE = Edges(0.0, 0.0, 1.0, 1.0)
 """The whole image."""
 
 
 class Found(NamedTuple):
     """A crop and its evidence."""
 
-    crop: Crop
+    crop: Edges
     """The whole image if no other crop was found."""
     correlation: float
     """Median correlation of the crop over clips."""
@@ -97,18 +97,18 @@ def find_crop(pairs: Sequence[Pair]) -> Found:
     couples = [_matched(pair, (whole, crop)) for pair in pairs]  # better ones, in a better crop
     crop = _refine(crop, couples)
     near = np.abs(np.subtract(crop, whole)) <= SNAP_PX
-    crop = Crop(*np.where(near, whole, crop).tolist())
+    crop = Edges(*np.where(near, whole, crop).tolist())
     gain = _evidence(crop, couples) - _evidence(whole, couples)
     slack = np.abs(np.subtract(crop, whole)).max()
     if slack <= MAX_SLACK_PX or gain.mean() < MIN_GAIN or np.median(gain) <= 0:
         crop = whole
     correlation = float(np.sqrt(1 - np.exp(-np.median(_evidence(crop, couples)))))
     found = correlation >= MIN_CORRELATION
-    shares = Crop(*np.divide(crop, (width, height) * 2).tolist())
+    shares = Edges(*np.divide(crop, (width, height) * 2).tolist())
     return Found(shares if found and crop is not whole else WHOLE, correlation, found)
 
 
-def _search(pairs: Sequence[Pair]) -> Crop:
+def _search(pairs: Sequence[Pair]) -> Edges:
     """Return the best crop among offsets and scales of small images at equal times."""
     import cv2
 
@@ -139,7 +139,7 @@ def _search(pairs: Sequence[Pair]) -> Crop:
             if (value := np.max(total)) > best:
                 best = value
                 left, top = int(left) - margin[0], int(top) - margin[1]
-                found = Crop(left / small, top / small, (left + size[0]) / small,
+                found = Edges(left / small, top / small, (left + size[0]) / small,
                              (top + size[1]) / small)  # fmt: skip
     return found
 
@@ -153,7 +153,7 @@ class _Couple(NamedTuple):
     """Pixels of `true` by recorded pixels, along columns and rows."""
 
 
-def _matched(pair: Pair, crops: Sequence[Crop]) -> _Couple:
+def _matched(pair: Pair, crops: Sequence[Edges]) -> _Couple:
     """Return the frame of a method, and the recorded frame, that are most similar in a crop."""
     video, true = pair
     height, width = true.shape[1:3]
@@ -176,13 +176,13 @@ def _matched(pair: Pair, crops: Sequence[Crop]) -> _Couple:
     return found
 
 
-def _evidence(crop: Crop, couples: Sequence[_Couple]) -> Float[np.ndarray, " n"]:
+def _evidence(crop: Edges, couples: Sequence[_Couple]) -> Float[np.ndarray, " n"]:
     """Return -log(1 - r^2) of each clip; an equal image counts as r = 0.9999."""
     r = np.array([_correlation(crop, couple) for couple in couples])
     return -np.log(1 - np.clip(r, 0, 0.9999) ** 2)
 
 
-def _correlation(crop: Crop, couple: _Couple) -> float:
+def _correlation(crop: Edges, couple: _Couple) -> float:
     """Return the correlation of an image with the crop it may show, inside the recorded image."""
     import cv2
 
@@ -215,7 +215,7 @@ def _correlation(crop: Crop, couple: _Couple) -> float:
     return float((a * b).sum()) / strength**0.5 if strength > 1e-6 else 0.0
 
 
-def _refine(start: Crop, couples: Sequence[_Couple]) -> Crop:
+def _refine(start: Edges, couples: Sequence[_Couple]) -> Edges:
     """Return the crop in pixels that has the most evidence near a first guess."""
     from scipy.optimize import minimize
 
@@ -223,14 +223,14 @@ def _refine(start: Crop, couples: Sequence[_Couple]) -> Crop:
     origin, steps = np.array(start), 0.02 * size
 
     def cost(x: np.ndarray) -> float:
-        return -float(_evidence(Crop(*(origin + x * steps)), couples).sum())
+        return -float(_evidence(Edges(*(origin + x * steps)), couples).sum())
 
     simplex = np.vstack([np.zeros(4), np.eye(4)])
     for _ in range(2):  # restarted once, since a simplex may collapse
         options = {"initial_simplex": simplex, "xatol": 2e-3, "fatol": 1e-5, "maxfev": 400}
         found = minimize(cost, simplex[0], method="Nelder-Mead", options=options).x
         simplex = np.vstack([found, found + 0.3 * np.eye(4)])
-    return Crop(*(origin + simplex[0] * steps).tolist())
+    return Edges(*(origin + simplex[0] * steps).tolist())
 
 
 def places(count: int, of: int) -> list[int]:

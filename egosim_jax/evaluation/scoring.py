@@ -24,7 +24,7 @@ from egosim_jax.evaluation.crops import find_crops
 from egosim_jax.evaluation.fvd import is_feature
 from egosim_jax.evaluation.measures import VERSION, GroundTruth, Measure, Scorer
 from egosim_jax.evaluation.methods import FIT, Folder, Method, Shape, read_at
-from egosim_jax.evaluation.registration import WHOLE, Crop
+from egosim_jax.evaluation.registration import WHOLE, Edges
 from egosim_jax.io.digest import fingerprint, sha256
 from egosim_jax.io.video import VideoInfo, probe_video
 from egosim_jax.runtime.progress import track
@@ -239,7 +239,7 @@ class Scoring:
         return rows
 
     @staticmethod
-    def _shape(count: int, crop: Crop, like: VideoInfo, shown: Crop, truth: VideoInfo) -> Shape:
+    def _shape(count: int, crop: Edges, like: VideoInfo, shown: Edges, truth: VideoInfo) -> Shape:
         """Return the shape at which a crop is compared, at the scale of `like`.
 
         The images of `like` show the part `shown` of the recorded image.

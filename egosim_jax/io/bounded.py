@@ -159,7 +159,7 @@ def read_lines(
 
 
 @contextmanager
-def refusing(message: str, kind: type[InputError] = InputError) -> Iterator[None]:
+def refusing(message: str) -> Iterator[None]:
     """Turn any exception of a decoder of untrusted bytes into `InputError`."""
     try:
         yield
@@ -167,7 +167,7 @@ def refusing(message: str, kind: type[InputError] = InputError) -> Iterator[None
         raise
     except Exception as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise kind(f"{message}: {quote_text(reason or type(error).__name__)}.") from error
+        raise InputError(f"{message}: {quote_text(reason or type(error).__name__)}.") from error
 
 
 def check_version(found: Any, supported: int, *, source: str) -> None:

@@ -33,14 +33,13 @@ from typing import Literal, cast
 import av
 import numpy as np
 from av.container import InputContainer
-from av.error import ArgumentError
 from av.packet import Packet
 from av.stream import Disposition
 from av.video.frame import VideoFrame
 from av.video.reformatter import ColorPrimaries, Interpolation, VideoReformatter
 from av.video.stream import VideoStream
 
-from egosim_jax.io.bounded import open_regular, quote_path, refusing
+from egosim_jax.io.bounded import open_regular, quote_path, quote_text
 from egosim_jax.io.boxes import check_boxes
 from egosim_jax.io.ffv1 import is_intact
 from egosim_jax.io.images import MAX_IMAGE_PIXELS
@@ -91,6 +90,15 @@ _TO_BT709 = (
 _ONE_VIEW, _RECTILINEAR = (0, 8), 4
 """FFmpeg's types of stereo with one view in a frame, and its projection of a pinhole."""
 _FORMATS = "MP4, MOV, Matroska, WebM, AVI or MPEG-TS"
+_CONVERT = "onvert it, for instance with `ffmpeg -i IN -pix_fmt yuv444p OUT.mp4`."
+_REASONS = {
+    av.error.ArgumentError: "it is of another format",
+    av.error.DecoderNotFoundError: "its codec is not known",
+    av.error.EOFError: "it ends too early",
+    av.error.InvalidDataError: "its data are not valid",
+    av.error.PatchWelcomeError: "it uses a part of its format that is not known",
+}
+"""FFmpeg's errors in plain words; others have its own words."""
 _OPTIONS = {
     "format_whitelist": "mov,mp4,m4a,matroska,webm,avi,mpegts",
     "protocol_whitelist": "none",
@@ -101,6 +109,28 @@ _OPTIONS = {
 
 class DamagedError(InputError):
     """Raised for a video that is truncated or damaged."""
+
+
+def damaged(name: str, problem: str) -> DamagedError:
+    """Return the error for a damaged video: the problem and the remedy."""
+    return DamagedError(f"{name} is damaged: {problem}. Download or export it again.")
+
+
+@contextmanager
+def _decoding(name: str) -> Iterator[None]:
+    """Turn any exception of FFmpeg into `DamagedError`."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        raise damaged(name, _reason(error)) from error
+
+
+def _reason(error: Exception) -> str:
+    """Return the reason of an exception of FFmpeg, without its number and file."""
+    own = error.strerror if isinstance(error, (av.FFmpegError, OSError)) else str(error)
+    return _REASONS.get(type(error)) or quote_text(own or type(error).__name__)
 
 
 @contextmanager
@@ -119,24 +149,23 @@ def open_video(file: File, name: str, max_frames: int | None) -> Iterator[VideoS
     Raises `InputError` for a file without a video stream, or if its color cannot be read right.
     """
     check_boxes(file, name)
-    with refusing(f"{name} is not a readable video"):
-        try:
-            container = av.open(file, mode="r", options=_OPTIONS, metadata_errors="replace")
-        except ArgumentError as error:  # of a format that is not in the list
-            raise InputError(
-                f"{name} is not a readable video: it must be {_FORMATS}. Convert it, for instance "
-                "with `ffmpeg -i IN -pix_fmt yuv444p OUT.mp4`."
-            ) from error
+    try:
+        container = av.open(file, mode="r", options=_OPTIONS, metadata_errors="replace")
+    except Exception as error:
+        raise InputError(
+            f"{name} is not a readable video: {_reason(error)}. It must be a whole file of "
+            f"{_FORMATS}. Download or export it again, or c{_CONVERT}"
+        ) from error
     with container:
         shown = [stream for stream in container.streams.video if not stream.disposition & _STILL]
         if not shown:
-            raise InputError(f"{name} has no video stream.")
+            raise InputError(f"{name} has no video stream. Give a file with one.")
         shown = [stream for stream in shown if stream.frames != 1] or shown  # 0 if not listed
         main = [stream for stream in shown if stream.disposition & Disposition.default]
         stream = (main or shown)[0]
         if stream.codec_context is None:
-            raise InputError(f"{name} is of a codec that is not known.")
-        with refusing(f"{name} is not a readable video"):
+            raise InputError(f"{name} is of a codec that is not known. C{_CONVERT}")
+        with _decoding(name):
             stream.codec_context.options = _OPTIONS
             stream.thread_type = "AUTO"
         _check_color(stream, name)
@@ -162,11 +191,11 @@ def read_packets(stream: VideoStream, name: str, max_frames: int) -> Iterator[Pa
     """
     read = 0
     try:
-        with refusing(f"{name} is damaged", DamagedError):
+        with _decoding(name):
             for number, packet in enumerate(container_of(stream).demux(stream)):
                 check_size(name, number // 2, 0, max_frames)  # empty packets count, too
                 if packet.is_corrupt:
-                    raise DamagedError(f"{name} is cut off after {read} frames.")
+                    raise damaged(name, f"it is cut off after {read} frames")
                 if packet.size:
                     check_packet(stream, packet, name)
                     read += 1
@@ -177,14 +206,14 @@ def read_packets(stream: VideoStream, name: str, max_frames: int) -> Iterator[Pa
     yield None
     listed = len(stream.index_entries)
     if read < listed:
-        raise DamagedError(f"{name} is cut off: it holds {read} of the {listed} frames it lists.")
+        raise damaged(name, f"it is cut off: it holds {read} of the {listed} frames it lists")
 
 
 def check_packet(stream: VideoStream, packet: Packet, name: str) -> None:
     """Raise `DamagedError` if a packet does not have the checksum that is in it."""
     coder = stream.codec_context
     if coder.name == "ffv1" and not is_intact(bytes(packet), coder.extradata):
-        raise DamagedError(f"{name} is damaged: a packet does not have its checksum.")
+        raise damaged(name, "a packet does not have its checksum")
 
 
 def skip_leading(packets: Iterable[Packet | None]) -> Iterator[Packet | None]:
@@ -205,7 +234,7 @@ def skip_leading(packets: Iterable[Packet | None]) -> Iterator[Packet | None]:
 
 def decode_packet(stream: VideoStream, packet: Packet | None, name: str) -> list[VideoFrame]:
     """Decode a packet; None flushes the decoder. Raises `DamagedError`."""
-    with refusing(f"{name} is damaged", DamagedError):
+    with _decoding(name):
         frames = stream.decode(packet)
     for frame in frames:
         _check_frame(frame, name)
@@ -221,12 +250,12 @@ def read_frames(stream: VideoStream, name: str, max_frames: int) -> Iterator[Vid
         for frame in decode_packet(stream, packet, name):
             size = size or (frame.height, frame.width)
             if frame.is_corrupt or size != (frame.height, frame.width):
-                raise DamagedError(f"{name} is damaged at frame {given}.")
+                raise damaged(name, f"its frame {given} is corrupt or of another size")
             given += 1
             check_size(name, given, size[0] * size[1], max_frames)
             yield frame
     if given != shown:
-        raise DamagedError(f"{name} is damaged: {given} of its {shown} frames can be decoded.")
+        raise damaged(name, f"{given} of its {shown} frames can be decoded")
 
 
 def to_rgb(

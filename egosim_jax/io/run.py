@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from egosim_jax.io.atomic import atomic_write, hold_folder
-from egosim_jax.io.bounded import listing, quote, quote_text, read_json
+from egosim_jax.io.bounded import MAX_QUOTED, listing, quote, quote_text, read_json
 from egosim_jax.types import InputError
 
 CONFIG, ENVIRONMENT = "config.json", "environment.json"
@@ -146,8 +146,14 @@ def _differences(recorded: Any, wanted: Any, path: str = "") -> dict[str, str]:
         for number, (one, other) in enumerate(zip(recorded, wanted, strict=True)):
             found |= _differences(one, other, f"{path}.{number}")
         return found
-    return {path: f"the folder has {_shown(recorded)}, this run has {_shown(wanted)}"}
+    one, other = _shown(recorded), _shown(wanted)
+    equal = next((n for n, (a, b) in enumerate(zip(one, other, strict=False)) if a != b), 0)
+    begin = equal - MAX_QUOTED // 4 if equal > MAX_QUOTED // 2 else 0  # to show the difference
+    one, other = (f"{'…' * (begin > 0)}{quote_text(text[begin:])}" for text in (one, other))
+    return {path: f"the folder has {one}, this run has {other}"}
 
 
 def _shown(value: Any) -> str:
-    return quote_text(json.dumps(value)) if isinstance(value, list | dict) else quote(value)
+    if isinstance(value, str):
+        return f"'{value}'"
+    return json.dumps(value) if isinstance(value, list | dict) else quote(value)

@@ -25,6 +25,7 @@ from egosim_jax.io.decoding import (
     FrameBuffer,
     check_size,
     container_of,
+    damaged,
     decode_packet,
     open_file,
     open_video,
@@ -148,7 +149,7 @@ def _decode(
             if len(kept) == len(stamps):
                 return kept.frames()
     at_s = (stamps[len(kept)] - int(listing.stamps[0])) * float(listing.unit_s)
-    raise DamagedError(f"{name} is damaged: its frame at {at_s:.3f} s cannot be decoded.")
+    raise damaged(name, f"its frame at {at_s:.3f} s cannot be decoded")
 
 
 def _list(file: File, name: str) -> Listing:
@@ -168,7 +169,7 @@ def _frames(stream: VideoStream, name: str, dts: int) -> Iterator[VideoFrame]:
         for decoded in decode_packet(stream, packet, name):
             size = size or (decoded.height, decoded.width)
             if decoded.is_corrupt or size != (decoded.height, decoded.width):
-                raise DamagedError(f"{name} is damaged at {decoded.time} s.")
+                raise damaged(name, f"its frame at {decoded.time} s is corrupt or of another size")
             count += 1
             check_size(name, count, size[0] * size[1], MAX_FRAMES)
             yield decoded

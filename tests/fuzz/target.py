@@ -21,7 +21,7 @@ class Target:
     A case passes if `read` raises `InputError` with a short message, or gives what it gave of the
     sample, or, where the format has no checksum of ours, gives what `reference` gives of the
     changed file. Everything else is a failure: another exception, another result, more than 1 GiB
-    or 20 s.
+    or 20 s of processor time.
     """
 
     name: str

@@ -14,6 +14,7 @@ from egosim_jax.annotate.sources import find_sources, open_source
 from egosim_jax.data.clip_files import ClipFiles
 from egosim_jax.data.clips import load_triplet
 from egosim_jax.data.importing import import_recordings
+from egosim_jax.data.metadata import read_metadata
 from egosim_jax.data.pack import pack
 from egosim_jax.data.readers.agibot import AgiBot
 from egosim_jax.data.readers.egodex import EgoDex
@@ -155,6 +156,18 @@ def by_rate(folder, film):
     return load_triplet(clip, RATED, policy="lenient", resampling="rate").hands
 
 
+def by_list(folder, film):
+    """Load the clip of a DWM list."""
+    for name in ("videos", "videos_hands", "videos_static"):
+        (folder / "a" / name).mkdir(parents=True)
+        shutil.copy(film, folder / "a" / name / "0.mp4")
+    (folder / "a/prompts").mkdir()
+    (folder / "a/prompts/0.txt").write_text("wave")
+    (folder / "list.txt").write_text("a/videos/0.mp4\n")
+    (clip,) = read_metadata(folder / "list.txt")
+    return load_triplet(clip, SPEC, policy="lenient").target
+
+
 def by_evaluate(folder, film):
     probe_video(film)
     return read_at(film, Shape(9, HEIGHT, WIDTH), 0)
@@ -170,6 +183,7 @@ PATHS = {
     "annotate": by_annotate,
     "pack": by_pack,
     "pack by rate": by_rate,
+    "DWM list": by_list,
     "evaluate": by_evaluate,
     "segments": by_segment,
     "video": lambda _, film: read_video(film).frames,

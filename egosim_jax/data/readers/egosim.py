@@ -6,9 +6,10 @@
         depth_000000.npy `h w` of the first frame
 
 Every frame needs a pose, and smoothed poses are preferred. Pixel centers are at integers, because
-the release back-projects points from integers. Depth Anything 3 estimates meters, so `metric` is
-True, up to its error. Hands come from HaMeR's results in _proc/mano_full (`hamer`), if they exist.
-Followed: jinkun-hao/EgoSim of 2026, `data_process`.
+the release back-projects points from integers. It runs DA3NESTED-GIANT-LARGE-1.1, which estimates
+meters, so `metric` is True, up to its error; the files do not name their network. Hands come from
+HaMeR's results in _proc/mano_full (`hamer`), if they exist. Followed: jinkun-hao/EgoSim of 2026,
+`data_process`.
 """
 
 from __future__ import annotations

@@ -63,7 +63,8 @@ class _Episode:
     stop_s: float
     data: Path | None
     length: int
-    tasks: tuple[str, ...]
+    tasks: tuple[str, ...] | None
+    """Texts of its tasks; None if only the table of its rows says which they are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,6 +84,7 @@ class LeRobot:
         episodes = _episodes_v3 if info["codebase_version"] == "v3.0" else _episodes_v2
         # Consecutive episodes share a video and a table.
         probe, read = lru_cache(maxsize=1)(probe_long_video), lru_cache(maxsize=1)(_read_stamps)
+        tasks = lru_cache(maxsize=1)(partial(_tasks_of_rows, self.source))
         for episode in episodes(self.source, info, camera):
             if isinstance(episode, str):
                 index, _, problem = episode.partition(": ")
@@ -94,7 +96,7 @@ class LeRobot:
                 continue
             yield Entry(
                 recording_id=f"episode_{episode.index:06d}",
-                read=partial(_read, episode, fps, probe, read),
+                read=partial(_read, episode, fps, probe, read, tasks),
                 source=episode.video,
                 options={"camera": camera},
             )
@@ -105,6 +107,7 @@ def _read(
     fps: Fraction,
     probe: Callable[[Path], VideoInfo],
     read: Callable[[Path], Mapping[int, list[Any]]],
+    read_texts: Callable[[Path], Mapping[int, tuple[str, ...]]],
     folder: Path,
 ) -> Recording:
     info = probe(episode.video)
@@ -127,6 +130,9 @@ def _read(
         )  # fmt: skip
     times_s = times_s[fits]
     start = _consecutive(info, times_s)
+    tasks = episode.tasks
+    if tasks is None:
+        tasks = read_texts(episode.data).get(episode.index, ()) if episode.data else ()
     return Recording(
         recording_id=f"episode_{episode.index:06d}",
         video=episode.video,
@@ -136,7 +142,7 @@ def _read(
         fps=fps,
         height=info.height,
         width=info.width,
-        caption="; ".join(episode.tasks) or None,
+        caption="; ".join(tasks) or None,
     )
 
 
@@ -323,21 +329,22 @@ def _episodes_v3(root: Path, info: Mapping[str, Any], camera: str) -> Iterator[_
                     stop_s=float("inf") if end_s is None else _time(end_s, "to_timestamp"),
                     data=_data_path(root, info, data),
                     length=_count(row["length"], "length", minimum=1),
-                    tasks=_texts(row["tasks"]) if "tasks" in row else _tasks(root, info, row),
+                    tasks=_texts(row["tasks"]) if "tasks" in row else None,
                 )
             except InputError as error:
                 yield f"{row['episode_index']!s:.20}: {error}"
 
 
-def _tasks(root: Path, info: Mapping[str, Any], row: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return an episode's tasks from the rows of its frames, if its own row has none."""
-    fields = {n: _count(row.get(f"data/{n}"), n) for n in ("chunk_index", "file_index")}
-    path = _fill(root, info.get("data_path"), fields, what="data_path")
-    frames = read_parquet(path, ["episode_index", "task_index"])
-    pairs = zip(frames["episode_index"], frames["task_index"], strict=True)
-    used = dict.fromkeys(task for episode, task in pairs if episode == row["episode_index"])
-    texts = read_tasks(root)
-    return tuple(texts[task] for task in used if task in texts)
+def _tasks_of_rows(root: Path, path: Path) -> dict[int, tuple[str, ...]]:
+    """Return the texts of each episode's tasks, in the order of its rows in a table."""
+    rows, texts = read_parquet(path, ["episode_index", "task_index"]), read_tasks(root)
+    used: dict[int, dict[int, None]] = {}
+    for episode, task in zip(rows["episode_index"], rows["task_index"], strict=True):
+        used.setdefault(episode, {})[task] = None
+    return {
+        episode: tuple(texts[task] for task in tasks if task in texts)
+        for episode, tasks in used.items()
+    }
 
 
 def read_tasks(root: Path) -> dict[int, str]:

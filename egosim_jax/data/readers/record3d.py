@@ -2,17 +2,17 @@
 
     NAME.r3d, a zip archive, or a folder with its files
         metadata        JSON: w h, dw dh, fps, K (9 numbers by columns), poses (qx qy qz qw x y z),
-                        perFrameIntrinsicCoeffs (fx fy cx cy, at w x h)
+                        perFrameIntrinsicCoeffs (fx fy cx cy, at w x h), frameTimestamps (seconds)
         rgbd/<n>.jpg    images
         rgbd/<n>.depth  float32 meters `dh dw`, compressed by LZFSE
 
 or a folder exported as "EXR + RGB", with metadata.json and rgb/<n>.jpg, whose EXR depth is not
 read. Poses are camera to world in ARKit's axes, which are OpenGL's, in meters; the world is y up.
-Pixel coordinates start at the corner of the image, so half a pixel is subtracted. ARKit refocuses
-continuously; the median over the frames is used if the focal length changes little. Depth is
-written as PNG in millimeters and needs the package pyliblzfse. Without it, depth is unknown, and
-the recording says so. Followed: nerfstudio 1.1, `record3d_utils.py`, and readers of .r3d files of
-2025.
+Images are taken by their time stamps (`io/timing.py`). Pixel coordinates start at the corner of the
+image, so half a pixel is subtracted. ARKit refocuses continuously; the median over the frames is
+used if the focal length changes little. Depth is written as PNG in millimeters and needs the
+package pyliblzfse. Without it, depth is unknown, and the recording says so. Followed: nerfstudio
+1.1, `record3d_utils.py`, and readers of .r3d files of 2025.
 """
 
 from __future__ import annotations
@@ -53,6 +53,7 @@ from egosim_jax.io.bounded import (
     read_bytes,
 )
 from egosim_jax.io.images import decode_image
+from egosim_jax.io.timing import row_times
 from egosim_jax.io.untrusted.npz import DAMAGE
 from egosim_jax.io.untrusted.zipped import from_file
 from egosim_jax.types import InputError, is_rigid
@@ -113,8 +114,8 @@ def _read(path: Path, folder: Path) -> Recording:
         run = longest_run(list(used), used.__getitem__)
         notes = describe_run(list(used), run)
         numbers = numbers[run] or numbers  # without a pose, the recording names the first
+        numbers, fps = _moments(metadata, numbers, path)
         poses = poses[numbers]
-        fps = Fraction(_number(metadata, "fps", path)).limit_denominator(1001)
         images = (
             decode_image(read(name), name=quote_text(name), pixels="stored")
             for name in map(numbered.__getitem__, numbers)
@@ -200,6 +201,29 @@ def _number(metadata: dict[str, Any], name: str, path: Path) -> float:
 def _poses(metadata: dict[str, Any], path: Path) -> np.ndarray:
     table = _numbers(metadata, "poses", 7, path)
     return make_poses(table[:, :4], table[:, 4:]) @ OPENCV_FROM_OPENGL
+
+
+def _moments(
+    metadata: dict[str, Any], numbers: list[int], path: Path
+) -> tuple[list[int], Fraction]:
+    """Return the images nearest to the moments of a constant rate, and the rate.
+
+    Captures without time stamps have the rate that they state.
+    """
+    fps = Fraction(_number(metadata, "fps", path)).limit_denominator(1001)
+    stamps = metadata.get("frameTimestamps")
+    if not isinstance(stamps, list) or not stamps:
+        return numbers, fps
+    known = [stamps[number] if number < len(stamps) else None for number in numbers]
+    rows, _, timeline = row_times(known, [fps], f"{quote_path(path)}, frameTimestamps")
+    if timeline.count > MAX_IMAGES:
+        raise InputError(
+            f"{quote_path(path)}: frameTimestamps give {timeline.count:,} frames at "
+            f"{float(timeline.fps):g} fps, more than {MAX_IMAGES:,}, the maximum. Split the "
+            "capture."
+        )
+    near = rows[timeline.nearest(timeline.moments_s(0, timeline.count))]
+    return [numbers[row] for row in near], timeline.fps
 
 
 def _lens(metadata: dict[str, Any], frames: int, path: Path) -> tuple[Lens, float]:

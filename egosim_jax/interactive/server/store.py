@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import Backend
-from egosim_jax.interactive.server.errors import STORAGE, RequestError, as_request_error
+from egosim_jax.interactive.server.errors import RequestError, as_request_error
 from egosim_jax.interactive.server.prometheus import Metrics
 from egosim_jax.interactive.server.requests import (
     check_integer,
@@ -384,9 +384,7 @@ class Store:
                 (self.folder / PROBE).unlink()
                 self._storage_failed = False
         except OSError as error:
-            if error.errno not in STORAGE:
-                raise
-            return os.strerror(error.errno)
+            return error.strerror or str(error)
         return ""
 
     def _for_client(self, error: Exception) -> Exception:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import math
+import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
@@ -20,6 +20,14 @@ DAMAGE = (ValueError, EOFError, OSError)
 MAX_ENTRIES = 64
 """Maximum number of arrays in a file."""
 _HEADER = 4096
+_SIZE = r"(?:0|[1-9][0-9]{0,18})\s*"
+_ITEM = re.compile(
+    r"""\s*['"](?:descr['"]\s*:\s*['"](?P<descr>[<>|=]?[?biufcOSUVmM][0-9]{0,3})['"]"""
+    r"""|fortran_order['"]\s*:\s*(?P<order>True|False)"""
+    rf"""|shape['"]\s*:\s*\((?P<shape>\s*(?:{_SIZE},\s*)*|\s*(?:{_SIZE},\s*)+{_SIZE})\))"""
+    r"\s*(?:,\s*|$)"
+)
+"""Item of an npy's header, such as `'shape': (2, 3), `."""
 
 
 def read_arrays(
@@ -58,6 +66,15 @@ def read_arrays(
         raise InputError(f"{name} is damaged: {quote_text(str(error))}.") from error
 
 
+def read_all(path: Path) -> dict[str, np.ndarray]:
+    """Read all arrays of an npz of this program. Raises `ValueError` if it is damaged."""
+    with open_archive(path) as archive:
+        return {
+            entry.removesuffix(".npy"): read_npy(archive.read(entry, limit=MAX_ARRAY_BYTES), entry)
+            for entry in archive.entries
+        }
+
+
 def array_names(path: Path) -> list[str]:
     """Return the names of the arrays of an npz. Raises `ValueError` if it is damaged."""
     with open_archive(path) as archive:
@@ -76,14 +93,36 @@ def _check_sizes(archive: Archive, packed: bool) -> None:
 
 def read_npy(data: bytes, name: str, *, dtype: str | None = None) -> np.ndarray:
     """Parse the bytes of an npy file of numbers, without pickle. Raises `ValueError`."""
-    header = io.BytesIO(data[:_HEADER])
     # NumPy writes later versions only for headers of 64 KiB and more, which numbers never need.
-    if np.lib.format.read_magic(header) != (1, 0):
-        raise ValueError(f"{name} is of another version of npy")
-    shape, fortran, kind = np.lib.format.read_array_header_1_0(header, max_header_size=_HEADER)
+    if data[:8] != b"\x93NUMPY\1\0":
+        raise ValueError(f"{name} is not of version 1.0 of npy")
+    start = 10 + int.from_bytes(data[8:10], "little")
+    shape, fortran, kind = _header(data[10 : min(start, _HEADER)].decode("latin-1"), name)
     if kind.hasobject or kind.kind not in "biuf" or (dtype is not None and kind != np.dtype(dtype)):
         raise ValueError(f"{name} holds {quote_text(str(kind))}")
-    if len(data) - header.tell() != math.prod(shape) * kind.itemsize:
+    if len(data) - start != math.prod(shape) * kind.itemsize:
         raise ValueError(f"{name} does not have the size that its header declares")
-    values = np.frombuffer(data, kind, offset=header.tell())
+    values = np.frombuffer(data, kind, offset=start)
     return values.reshape(shape, order="F" if fortran else "C").copy(order="C")
+
+
+def _header(text: str, name: str) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Return the shape, the order and the dtype in the header of an npy file.
+
+    NumPy's own reader calls `ast`, whose counter of recursions is wrong in Python 3.11 after a
+    switch of threads during a garbage collection, in which jax runs code.
+    """
+    found, rest = dict[str, str](), text.strip()
+    framed = rest.startswith("{") and rest.endswith("}") and not ("'" in rest and '"' in rest)
+    rest = rest[1:-1]
+    while item := _ITEM.match(rest):
+        found |= {key: value for key, value in item.groupdict().items() if value is not None}
+        rest = rest[item.end() :]
+    if not framed or rest or len(found) < 3:
+        raise ValueError(f"{name} has the header {quote(text)}, which does not describe numbers")
+    try:
+        kind = np.dtype(found["descr"])
+    except TypeError as error:
+        raise ValueError(f"{name} holds {quote(found['descr'])}") from error
+    shape = tuple(int(size) for size in found["shape"].split(",") if size.strip())
+    return shape, found["order"] == "True", kind

@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from egosim_jax.geometry import invert
-from egosim_jax.io.bounded import open_regular, quote_path, quote_text
+from egosim_jax.io.bounded import quote_path, quote_text, read_bytes
+from egosim_jax.io.untrusted.npz import read_npy
 from egosim_jax.perception.estimates import CameraEstimate, DepthEstimate, Verdict
 from egosim_jax.types import Cameras, InputError
 
@@ -91,14 +92,10 @@ class DepthFiles:
     def _read(self, kind: str, frame: int) -> np.ndarray:
         path = self._path(kind, frame)
         try:
-            with open_regular(path) as file:
-                version = np.lib.format.read_magic(file)
-                read = np.lib.format.read_array_header_1_0
-                shape, _, dtype = read(file) if version == (1, 0) else ((), False, np.dtype("O"))
-                if dtype.kind not in "fiu" or not 0 < np.prod(shape) <= MAX_VALUES:
-                    raise ValueError(f"it holds {dtype} {shape}")
-                file.seek(0)
-                return np.lib.format.read_array(file, allow_pickle=False).astype(float)
+            values = read_npy(read_bytes(path, limit=9 * MAX_VALUES), "it")
+            if values.dtype == bool or not 0 < values.size <= MAX_VALUES:
+                raise ValueError(f"it holds {values.dtype} {values.shape}")
+            return values.astype(float)
         except InputError:
             raise
         except (ValueError, EOFError) as error:

@@ -8,6 +8,7 @@ import pytest
 
 from egosim_jax.annotate.clip import ANNOTATION
 from egosim_jax.annotate.frames import Sampling
+from egosim_jax.annotate.sources import Source, open_source
 from egosim_jax.data.recorded_files import DepthFiles
 from egosim_jax.data.recording import Recording
 from egosim_jax.io.bounded import read_json
@@ -88,6 +89,20 @@ def test_measured_depth_gives_the_scene_and_the_scale(recording, tmp_path):
     assert about["cameras"]["focal_source"] == "recording"
     assert about["cameras"]["focal_px"] == 60
     assert np.allclose(snapshot.load(out / "take/state").points_m[:, 2], 0.7)
+
+
+def test_given_depth_is_numbered_by_the_frames_of_the_video(recording, tmp_path):
+    for number in range(17):
+        path = tmp_path / f"depth/take/{number:06d}.npy"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, np.full((24, 40), 1 + number, np.float32))
+    cut = replace(recording.clip(3, 17), depth=None)
+    timed = replace(recording, times_s=np.arange(17) / 20 + 0.01, fps=Fraction(20), joints_m=None)
+    for name, numbers in ((cut, range(3, 17)), (timed, np.rint(np.arange(17) * 0.8 + 0.16))):
+        name.save(tmp_path / "imported")
+        opened = open_source(Source(name="take", path=tmp_path / "imported"), tmp_path / "depth")
+        found = [opened.read_depth(frame)[0, 0] for frame in range(opened.frames)]
+        np.testing.assert_array_equal(found, 1 + np.array(numbers))
 
 
 def test_a_fused_scene_has_what_later_frames_show(recording, tmp_path):

@@ -66,6 +66,20 @@ def test_an_episode_is_read_at_another_rate_and_size_and_in_another_scene(record
     assert snapshot.fingerprint(episode.state) == snapshot.fingerprint(state)
 
 
+def test_a_camera_that_never_moves_is_said(recorded, tmp_path, caplog):
+    episode_from_lerobot(recorded[0], 0, VIDEO)
+    assert not caplog.text
+    shutil.copytree(recorded[0], tmp_path / "set")
+    path = next((tmp_path / "set/data").rglob("*.parquet"))
+    table = pq.read_table(path)
+    column = table.schema.get_field_index(POSES)
+    poses = pa.array([table[POSES][0].as_py()] * len(table), table[POSES].type)
+    pq.write_table(table.set_column(column, POSES, poses), path)
+    episode_from_lerobot(tmp_path / "set", 0, VIDEO)
+    assert "Episode 0 of" in caplog.text
+    assert "the camera is at rest, or its poses are placeholders" in caplog.text
+
+
 def test_rows_are_taken_by_their_time_stamps(recorded, tmp_path):
     """Stamps that are twice as far apart halve the rate, whatever info.json says."""
     shutil.copytree(recorded[0], tmp_path / "set")

@@ -1,9 +1,14 @@
 """`egosim data annotate` and `egosim episode from-annotation`."""
 
+from dataclasses import replace
+
 import pytest
 
+from egosim_jax.annotate.clip import ANNOTATION
 from egosim_jax.annotate.config import AnnotateConfig
 from egosim_jax.cli.__main__ import main
+from egosim_jax.io.bounded import read_json
+from egosim_jax.perception.cameras import CameraLadder
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.simulation.episode import Episode
 from tests.unit.annotate.stubs import config, textured_video, write
@@ -39,6 +44,21 @@ def test_a_video_without_clips_is_named_with_its_reason(video, tmp_path, capsys)
     assert "bad: no clip: " in shown
     assert "is empty" in shown
     assert "1 clips done, 0 refused, 0 failed" in shown
+
+
+@pytest.mark.parametrize("options", [[], ["--focal", "120"]])
+def test_an_assumed_focal_length_is_said(video, tmp_path, capsys, monkeypatch, options):
+    focal = 120.0 if options else None
+    parts = replace(config().build(), cameras=CameraLadder(rung="static", focal_px=focal))
+    monkeypatch.setattr(AnnotateConfig, "build", lambda self: parts)
+    out = tmp_path / "out"
+    command = ["data", "annotate", str(video), "--out", str(out), *OPTIONS, *options]
+    assert main(command) == ExitCode.DONE
+    said = "1 clips do not show their focal length: 80 pixels of the clip" in (
+        capsys.readouterr().err
+    )
+    source = read_json(out / "cup" / ANNOTATION)["cameras"]["focal_source"]
+    assert (said, source) == ((False, "--focal") if options else (True, "assumed"))
 
 
 def test_a_models_clips_have_its_size_rate_and_length(video, tmp_path):

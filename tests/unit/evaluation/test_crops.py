@@ -12,7 +12,7 @@ from PIL import Image
 from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.table import TableCommand
 from egosim_jax.evaluation.metrics import lpips
-from egosim_jax.evaluation.registration import WHOLE, Crop, find_crop
+from egosim_jax.evaluation.registration import WHOLE, Edges, find_crop
 from egosim_jax.io.video import write_video
 from egosim_jax.runtime.command import ExitCode
 
@@ -112,10 +112,10 @@ def test_a_blurred_or_noisy_whole_image_stays_whole(sigma):
 
 
 def test_crops_intersect_and_are_relative():
-    one, other = Crop(0.1, 0.0, 0.7, 1.0), Crop(0.3, 0.25, 1.0, 0.75)
-    assert one.common(other) == Crop(0.3, 0.25, 0.7, 0.75)
+    one, other = Edges(0.1, 0.0, 0.7, 1.0), Edges(0.3, 0.25, 1.0, 0.75)
+    assert one.common(other) == Edges(0.3, 0.25, 0.7, 0.75)
     assert other.common(other).within(other) == pytest.approx((0, 0, 1, 1))
-    assert Crop(0.2, 0.1, 0.8, 0.9).whole_pixels(24, 32).pixels(24, 32) == (7, 3, 25, 21)
+    assert Edges(0.2, 0.1, 0.8, 0.9).whole_pixels(24, 32).pixels(24, 32) == (7, 3, 25, 21)
 
 
 @pytest.fixture

@@ -103,8 +103,14 @@ def test_a_mutable_field_may_change_and_is_recorded(tmp_path):
         ([], ["cup"], r'names: the folder has \[\], this run has \["cup"\]'),
         ([{"seed": 1}], [{"seed": 2}], r"names\.0\.seed: the folder has 1, this run has 2"),
         ({"a": 1}, [1], r'names: the folder has {"a": 1}, this run has \[1\]'),
+        (
+            [*range(90)],
+            [*range(91)],
+            r"has ….*, 88, 89\], .* has ….*, 88, 89, 90\]",
+        ),
+        ("a" * 99 + "b", "a" * 99 + "c", r"names: the folder has …a+b', this run has …a+c'"),
     ],
-    ids=["item", "shorter", "empty", "nested", "kinds"],
+    ids=["item", "shorter", "empty", "nested", "kinds", "longer", "end of a text"],
 )
 def test_different_lists_are_shown_by_their_difference(tmp_path, recorded, wanted, message):
     open_folder(tmp_path, {"names": recorded})

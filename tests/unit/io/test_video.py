@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import struct
 import tempfile
 from fractions import Fraction
@@ -9,9 +10,11 @@ from fractions import Fraction
 import av
 import numpy as np
 import pytest
+from PIL import Image
 
 from egosim_jax.io import decoding
 from egosim_jax.io.boxes import check_boxes
+from egosim_jax.io.decoding import DamagedError
 from egosim_jax.io.images import read_image
 from egosim_jax.io.segments import probe_long_video
 from egosim_jax.io.video import (
@@ -104,11 +107,60 @@ def test_a_bad_file_is_refused_by_name(tmp_path, reader, content, message):
     assert str(path) in str(caught.value)
 
 
-def test_a_truncated_file_is_refused(tmp_path):
-    data = encode_video(smooth(), 16)
-    (tmp_path / "half.mp4").write_bytes(data[: len(data) // 2])
-    with pytest.raises(InputError, match="is not a readable video"):
-        read_video(tmp_path / "half.mp4")
+def as_image(form):
+    file = io.BytesIO()
+    first, *others = map(Image.fromarray, smooth())
+    if form == "GIF":
+        first.save(file, form, save_all=True, append_images=others)
+    else:
+        first.save(file, form)
+    return file.getvalue()
+
+
+UNREADABLE = {
+    "half": lambda: encode_video(smooth(), 16)[:-1300],
+    "page": lambda: b"<html>404 Not Found</html>",
+    "zeros": lambda: bytes(5000),
+    "sound": lambda: b"ID3" + bytes(3000),
+    "gif": lambda: as_image("GIF"),
+    "png": lambda: as_image("PNG"),
+}
+
+
+@pytest.mark.parametrize("reader", [read_video, probe_video, probe_long_video])
+@pytest.mark.parametrize("content", UNREADABLE)
+def test_a_file_that_is_no_video_is_refused_in_plain_words(content, reader, tmp_path):
+    path = tmp_path / "a.mp4"
+    path.write_bytes(UNREADABLE[content]())
+    reason = "it is of another format" if content in ("gif", "png") else "its data are not valid"
+    with pytest.raises(InputError) as caught:
+        reader(path)
+    assert str(caught.value) == (
+        f"{path} is not a readable video: {reason}. It must be a whole file of MP4, MOV, Matroska, "
+        "WebM, AVI or MPEG-TS. Download or export it again, or convert it, for instance with "
+        "`ffmpeg -i IN -pix_fmt yuv444p OUT.mp4`."
+    )
+
+
+def test_every_error_of_ffmpeg_is_put_in_plain_words():
+    kinds = [kind for kind in vars(av.error).values() if isinstance(kind, type)]
+    kinds = [kind for kind in kinds if issubclass(kind, av.FFmpegError)]
+    assert len(kinds) > 30
+    for kind in kinds:
+        error = kind(1094995529, "Some words", "3")
+        with pytest.raises(DamagedError) as caught, decoding._decoding("a.mp4"):
+            raise error
+        message = str(caught.value)
+        assert re.fullmatch(r"a\.mp4 is damaged: [\w ]+\. Download or export it again\.", message)
+        assert not any(character.isdigit() for character in message.removeprefix("a.mp4"))
+
+
+def test_an_invalid_packet_is_named_in_plain_words():
+    data = bytearray(encode_video(detailed(), 16))
+    begin = data.index(b"mdat") + 1800
+    data[begin : begin + 500] = bytes(500)
+    with pytest.raises(DamagedError, match=r"damaged: its data are not valid\. Download or export"):
+        decode_video(bytes(data))
 
 
 def test_a_range_beyond_the_end_is_refused():
@@ -183,7 +235,7 @@ def test_a_frame_marked_as_corrupt_is_refused(monkeypatch):
             decode_video(flipped(data, at))
         except InputError as error:
             messages.append(str(error))
-    assert any("is damaged at frame" in message for message in messages)
+    assert any("is corrupt or of another size" in message for message in messages)
 
 
 def test_a_packet_without_a_frame_is_refused():

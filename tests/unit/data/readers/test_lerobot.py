@@ -8,6 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from egosim_jax.data.readers import lerobot
 from egosim_jax.data.readers.lerobot import LeRobot, read_tasks
 from egosim_jax.types import InputError
 
@@ -91,6 +92,28 @@ def test_v3_tasks_are_read_from_frames_where_episodes_do_not_name_them(world, tm
     write_v3(tmp_path / "set", world, tasks=False)
     done, _ = imported(LeRobot(source=tmp_path / "set"))
     assert [r.caption for r in done.values()] == ["pick the cup", "place the cup"]
+
+
+def test_tasks_of_frames_are_read_once_for_all_episodes_of_a_table(
+    world, tmp_path, imported, monkeypatch
+):
+    write_v3(tmp_path / "set", world, tasks=False)
+    read, paths = lerobot.read_parquet, []
+    monkeypatch.setattr(
+        lerobot, "read_parquet", lambda p, c, **o: paths.append((p.name, *c)) or read(p, c, **o)
+    )
+    assert len(imported(LeRobot(source=tmp_path / "set"))[0]) == 2
+    assert [path for path in paths if "task_index" in path] == [
+        ("file-000.parquet", "episode_index", "task_index"),
+        ("tasks.parquet", "task_index"),
+    ]
+
+
+def test_an_episode_without_a_table_has_no_task(world, tmp_path, imported):
+    write_v3(tmp_path / "set", world, tasks=False, data_path="")
+    done, problems = imported(LeRobot(source=tmp_path / "set"))
+    assert [recording.caption for recording in done.values()] == [None, None]
+    assert not problems
 
 
 def test_both_forms_of_tasks_are_read(tmp_path):

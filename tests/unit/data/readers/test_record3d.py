@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from egosim_jax.data.readers import record3d
 from egosim_jax.data.readers.lzfse import unpacked_size
 from egosim_jax.data.readers.record3d import Record3D
 from egosim_jax.types import InputError
@@ -84,6 +85,44 @@ def test_poses_and_intrinsics_are_those_of_the_scene(world, tmp_path, imported, 
     assert recording.metric
     assert recording.fps == 60
     world.assert_first(recording)
+
+
+TIMES = 10.0 + np.arange(12) / 30
+
+
+@pytest.mark.parametrize(
+    ("stamps", "expected"),
+    [
+        (TIMES, range(12)),
+        (np.delete([*TIMES, TIMES[-1] + 1 / 30], 5), [0, 1, 2, 3, 4, 5, *range(5, 12)]),
+        (np.where(np.arange(12) == 4, TIMES[3], TIMES), [0, 1, 2, 3, 5, *range(5, 12)]),
+        (TIMES[:9], range(9)),
+        ([*TIMES[:5], None, *TIMES[6:]], [0, 1, 2, 3, 4, 6, *range(6, 12)]),
+    ],
+    ids=["rate", "missing", "repeated", "shorter", "without"],
+)
+def test_images_are_taken_by_their_time_stamps(world, tmp_path, imported, stamps, expected):
+    stamps = [None if stamp is None else round(float(stamp), 6) for stamp in stamps]
+    write_capture(tmp_path / "scan.r3d", world, frameTimestamps=stamps)
+    done, problems = imported(Record3D(source=tmp_path))
+    assert not problems
+    recording = done["scan"]
+    assert (recording.fps, recording.frames) == (30, len(expected))
+    np.testing.assert_allclose(recording.world_from_camera, world.poses[[*expected]], atol=1e-9)
+    shown = recording.read_frames().frames[:, 2:6, 2:6].mean(axis=(1, 2, 3))
+    np.testing.assert_allclose(shown, 10 + 20 * np.array(expected), atol=8)
+
+
+def test_time_stamps_of_too_many_frames_or_with_a_pause_are_refused(
+    world, tmp_path, imported, monkeypatch
+):
+    write_capture(tmp_path / "pause.r3d", world, frameTimestamps=[*TIMES[:6], *(TIMES[6:] + 1)])
+    write_capture(tmp_path / "many.r3d", world, frameTimestamps=[0, 1e-4, *(0.2 * TIMES)])
+    monkeypatch.setattr(record3d, "MAX_IMAGES", 100)
+    done, problems = imported(Record3D(source=tmp_path))
+    assert not done
+    assert "variable frame rate" in problems["pause"]
+    assert "more than 100, the maximum. Split the capture." in problems["many"]
 
 
 def test_depth_is_in_meters_and_unknown_where_it_is_not_finite(world, tmp_path, imported, unpacker):

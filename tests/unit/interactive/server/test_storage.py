@@ -101,6 +101,13 @@ def test_a_nearly_full_disk_is_not_ready(store, monkeypatch):
     assert store.storage_problem() == "No space left on device"
 
 
+def test_a_server_whose_folder_is_gone_is_not_ready(store):
+    store.folder.rename(store.folder.with_name("moved"))
+    assert store.storage_problem() == "No such file or directory"
+    store.folder.with_name("moved").rename(store.folder)
+    assert not store.storage_problem()
+
+
 def test_a_library_that_names_only_the_reason_is_understood():
     error = RuntimeError("write failed: No space left on device")
     assert as_request_error(error).code == "storage"
