@@ -1,0 +1,114 @@
+"""Processes with any rows of a batch train as one process does.
+
+`run_rows` runs several meshes in each start of processes. Two records cannot be read.
+"""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egosim_jax.configs.model import Networks
+from egosim_jax.data.shards import ShardReader
+from egosim_jax.io.video import read_video
+from egosim_jax.testing import write_latents
+from tests.training import run_tiny
+from tests.training.killing import logged
+from tests.training.line import write_points
+from tests.training.run_rows import SAVE_EVERY, STEPS, Case, launch, run
+
+ORDERS = ("in order", "interleaved", "scattered")
+
+
+@pytest.fixture(scope="module")
+def points(tmp_path_factory) -> str:
+    return str(write_points(tmp_path_factory.mktemp("points"), unreadable=(3, 17)))
+
+
+@pytest.fixture(scope="module")
+def alone(points, tmp_path_factory) -> Path:
+    """The run of one process with one device."""
+    out = tmp_path_factory.mktemp("alone")
+    run(Case("alone", points), out)
+    return out / "alone"
+
+
+def check(out: Path, alone: Path, *, first: int = 1) -> None:
+    """Compare the run folder OUT with that of one process, from update `first` on."""
+    have, want = (dict(np.load(f"{folder}.npz")) for folder in (out, alone))
+    # The first batch is the example that the update is compiled for.
+    for name in ("record", "x"):
+        np.testing.assert_array_equal(have[name][1:], want[name][first:])
+    np.testing.assert_allclose(have["weights"], want["weights"], rtol=1e-6, atol=1e-6)
+    logs = logged(out), logged(alone)
+    assert [line.keys() for line in logs[0]] == [line.keys() for line in logs[1]]
+    for mine, theirs in zip(*logs, strict=True):
+        assert mine == pytest.approx(theirs, rel=1e-6)
+
+
+def interrupted(run: Path, copy: Path) -> None:
+    """Copy a run without its last checkpoint."""
+    shutil.copytree(run, copy)
+    shutil.rmtree(copy / "checkpoints" / str(STEPS))
+
+
+def test_a_single_process_reads_the_next_record_instead_of_a_bad_one(points, alone):
+    batches, source = np.load(f"{alone}.npz"), ShardReader(Path(points))
+    assert batches["record"].shape == (1 + STEPS, 8)
+    counts = np.bincount(batches["record"][1:].ravel(), minlength=40)
+    assert counts[[3, 17]].tolist() == [0, 0]
+    assert sorted(counts) == [0, 0, *[1] * 36, 2, 2]
+    for record, x in zip(batches["record"].ravel(), batches["x"].reshape(-1, 4), strict=True):
+        np.testing.assert_array_equal(source[int(record)].arrays["x"], x)
+
+
+def test_two_processes_with_any_rows_train_as_one_and_resume_its_run(points, alone, tmp_path):
+    cases = [
+        Case("fsdp", points),
+        Case("interleaved", points, order="interleaved", parts=2),
+        Case("context", points, (2, 1, 2), order="interleaved"),
+        Case("resumed", points, order="interleaved"),
+    ]
+    interrupted(alone, tmp_path / "resumed")
+    launch(tmp_path, cases, processes=2, devices=2)
+    for case in cases[:-1]:
+        check(tmp_path / case.name, alone)
+    check(tmp_path / "resumed", alone, first=SAVE_EVERY + 1)
+    interrupted(tmp_path / "interleaved", tmp_path / "back")
+    run(Case("back", points), tmp_path)
+    check(tmp_path / "back", alone, first=SAVE_EVERY + 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("processes", "devices"), [(2, 4), (4, 2), (8, 1)])
+def test_more_processes_with_any_rows_train_as_one(points, alone, tmp_path, processes, devices):
+    meshes = [(1, 8, 1), (2, 2, 2), (4, 2, 1), (1, 2, 4)]
+    cases = [
+        Case(f"{order} {mesh}", points, mesh, order, parts=1 if mesh[2] == 1 else 2)
+        for order in ORDERS
+        for mesh in meshes[ORDERS.index(order) :]
+    ]
+    interrupted(alone, tmp_path / "resumed")
+    cases.append(Case("resumed", points, (2, 2, 2), "scattered"))
+    launch(tmp_path, cases, processes=processes, devices=devices)
+    for case in cases[:-1]:
+        check(tmp_path / case.name, alone)
+    check(tmp_path / "resumed", alone, first=SAVE_EVERY + 1)
+
+
+@pytest.mark.slow
+def test_a_denoiser_whose_clips_two_processes_share_trains_and_draws_samples_as_one(tmp_path):
+    data, weights = tmp_path / "latents", tmp_path / "weights"
+    write_latents(data, run_tiny.MODEL)
+    Networks.random(run_tiny.MODEL, seed=0).save(weights)
+    shared = {"data": str(data), "weights": str(weights)}
+    run(Case("alone", **shared), tmp_path)
+    case = Case("context", mesh=(1, 2, 2), order="interleaved", **shared)
+    launch(tmp_path, [case], processes=2, devices=2)
+    check(tmp_path / "context", tmp_path / "alone")
+    clips = [
+        read_video(tmp_path / name / "samples" / f"step_{STEPS:06d}.mp4").frames
+        for name in ("context", "alone")
+    ]
+    assert np.abs(np.subtract(*clips, dtype=int)).max() <= 2
