@@ -26,7 +26,7 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 from flax import nnx
-from jax.experimental import mesh_utils
+from jax.experimental import mesh_utils, multihost_utils
 from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding, PartitionSpec
 
 from egosim_jax.types import InputError, MeshConfig
@@ -168,6 +168,16 @@ def assemble(
         return jax.make_array_from_callback((size, *value.shape[1:]), sharding, part)
 
     return {name: place(name, value) for name, value in rows.items()}
+
+
+def fetch(array: jax.Array) -> np.ndarray:
+    """Return a whole array, on every process.
+
+    All processes that hold a part of it call this.
+    """
+    if array.is_fully_addressable:
+        return np.asarray(array)
+    return multihost_utils.process_allgather(array, tiled=True)
 
 
 def _rows(indices: Iterable[Any], size: int) -> tuple[int, ...]:

@@ -20,6 +20,9 @@ import numpy as np
 from flax import nnx
 from jax.experimental import mesh_utils, multihost_utils
 
+from egosim_jax.generation.generator import Generator
+from egosim_jax.sharding import make_mesh
+from egosim_jax.testing import random_triplet
 from egosim_jax.train.distributed import distributed_context, free_local_address
 from egosim_jax.train.loop import Run, train
 from egosim_jax.train.monitor import Samples
@@ -40,8 +43,10 @@ class Case:
     mesh: tuple[int, int, int] = (1, -1, 1)
     """Sizes of data, fsdp and context."""
     order: str = "in order"
-    """Of the devices in the mesh; interleaved: the first device of each process, then the second;
-    scattered: any, so that processes may share a part of their rows."""
+    """Order of the devices in the mesh.
+
+    Interleaved: the first device of each process, then the second. Scattered: any, so that
+    processes may share a part of their rows."""
     parts: int = 1
     """Number of gradient accumulation steps."""
     weights: str | None = None
@@ -94,12 +99,21 @@ def run(case: Case, out: Path) -> None:
             out=out / case.name,
             samples=samples,
         )
+        generated = {} if case.weights is None else generate(case)
     weights = [leaf.get_value() for _, leaf in nnx.to_flat_state(nnx.state(networks, nnx.Param))]
     weights = multihost_utils.process_allgather([w for w in weights if w.size], tiled=True)
     if jax.process_index() == 0:
         batches = {name: np.stack([batch[name] for batch in seen]) for name in seen[0]}
         flat = np.concatenate([np.ravel(weight) for weight in weights])
-        np.savez(out / f"{case.name}.npz", weights=flat, **batches)
+        np.savez(out / f"{case.name}.npz", weights=flat, **batches, **generated)
+
+
+def generate(case: Case) -> dict[str, np.ndarray]:
+    """Return the clips that a generator makes on the mesh of a case."""
+    model, mesh = run_tiny.MODEL, make_mesh(MeshConfig(*case.mesh))
+    triplets = [random_triplet(model.video, seed) for seed in range(2)]
+    generator = Generator.load(model, case.weights, mesh=mesh)
+    return {"clips": np.stack([clip.frames for clip in generator.generate(triplets, [5, 6])])}
 
 
 def launch(out: Path, cases: Sequence[Case], *, processes: int, devices: int) -> None:

@@ -4,6 +4,7 @@
 """
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,11 @@ import pytest
 from egosim_jax.configs.model import Networks
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.io.video import read_video
+from egosim_jax.preflight.targets import DEVICES, Target
 from egosim_jax.testing import write_latents
+from egosim_jax.train import preflight, recipes
+from egosim_jax.types import InputError, MeshConfig
+from tests.machines import MACHINES
 from tests.training import run_tiny
 from tests.training.killing import logged
 from tests.training.line import write_points
@@ -35,10 +40,10 @@ def alone(points, tmp_path_factory) -> Path:
 
 
 def check(out: Path, alone: Path, *, first: int = 1) -> None:
-    """Compare the run folder OUT with that of one process, from update `first` on."""
+    """Compare the run folder OUT with the run of one process, from update `first` on."""
     have, want = (dict(np.load(f"{folder}.npz")) for folder in (out, alone))
     # The first batch is the example that the update is compiled for.
-    for name in ("record", "x"):
+    for name in have.keys() & {"record", "x"}:
         np.testing.assert_array_equal(have[name][1:], want[name][first:])
     np.testing.assert_allclose(have["weights"], want["weights"], rtol=1e-6, atol=1e-6)
     logs = logged(out), logged(alone)
@@ -80,6 +85,30 @@ def test_two_processes_with_any_rows_train_as_one_and_resume_its_run(points, alo
     check(tmp_path / "back", alone, first=SAVE_EVERY + 1)
 
 
+def test_the_preflight_prints_the_rows_of_each_host():
+    stage = next(iter(recipes.get("egosim_14b").stages().values()))
+    stage = stage._replace(training=replace(stage.training, batch_size=16, grad_accum_steps=1))
+    target = Target(name="v6e:4x4", device=DEVICES["v6e"], devices=MACHINES["v6e:4x4"])
+    hosts = preflight.hosts_of(stage, target)
+    assert [host.rows for host in hosts] == [
+        (0, 1, 6, 15), (2, 3, 4, 5), (7, 12, 13, 14), (8, 9, 10, 11),
+    ]  # fmt: skip
+    assert [host.devices for host in hosts] == [4] * 4
+    assert preflight._rows(hosts).splitlines() == [
+        "  rows of the batch by host, 4 devices each",
+        "    0  0, 1, 6, 15",
+        "    1  2 to 5",
+        "    2  7, 12 to 14",
+        "    3  8 to 11",
+    ]
+    shared = replace(stage.training, mesh=MeshConfig(context=8))
+    hosts = preflight.hosts_of(stage._replace(training=shared), target)
+    assert preflight._rows(hosts).splitlines()[1:] == ["    0, 1  0 to 7", "    2, 3  8 to 15"]
+    refused = replace(stage.training, batch_size=24)
+    with pytest.raises(InputError, match="A batch of 24 cannot be shared"):
+        preflight.hosts_of(stage._replace(training=refused), target)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("processes", "devices"), [(2, 4), (4, 2), (8, 1)])
 def test_more_processes_with_any_rows_train_as_one(points, alone, tmp_path, processes, devices):
@@ -98,7 +127,7 @@ def test_more_processes_with_any_rows_train_as_one(points, alone, tmp_path, proc
 
 
 @pytest.mark.slow
-def test_a_denoiser_whose_clips_two_processes_share_trains_and_draws_samples_as_one(tmp_path):
+def test_two_processes_that_share_clips_train_sample_and_generate_as_one(tmp_path):
     data, weights = tmp_path / "latents", tmp_path / "weights"
     write_latents(data, run_tiny.MODEL)
     Networks.random(run_tiny.MODEL, seed=0).save(weights)
@@ -107,6 +136,8 @@ def test_a_denoiser_whose_clips_two_processes_share_trains_and_draws_samples_as_
     case = Case("context", mesh=(1, 2, 2), order="interleaved", **shared)
     launch(tmp_path, [case], processes=2, devices=2)
     check(tmp_path / "context", tmp_path / "alone")
+    clips = [np.load(tmp_path / f"{name}.npz")["clips"] for name in ("context", "alone")]
+    assert np.abs(np.subtract(*clips, dtype=int)).max() <= 1
     clips = [
         read_video(tmp_path / name / "samples" / f"step_{STEPS:06d}.mp4").frames
         for name in ("context", "alone")
