@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import cycle, islice
 from pathlib import Path
 from statistics import median
 from typing import Any, Literal
@@ -20,6 +21,7 @@ from typing import Any, Literal
 import jax
 import numpy as np
 from flax import nnx
+from jax.experimental import multihost_utils
 
 from egosim_jax.conditioning.pixels import to_uint8
 from egosim_jax.configs.model import ModelConfig, Networks
@@ -29,7 +31,7 @@ from egosim_jax.data.shards import ShardReader
 from egosim_jax.generation.generator import denoise
 from egosim_jax.preflight.targets import peak
 from egosim_jax.runtime.command import CommandExit, ExitCode
-from egosim_jax.sharding import assemble, batch_sharding, fetch, parts, process_rows
+from egosim_jax.sharding import batch_sharding, parts
 from egosim_jax.train.tasks.denoising import condition_of
 from egosim_jax.train.update import MAX_CONSECUTIVE_SKIPS
 from egosim_jax.types import check_counts
@@ -255,7 +257,8 @@ class Samples:
         draw_sheet(blocks, path.with_suffix(".png"), moments=moments)
 
     def _frames(self, latents: jax.Array) -> np.ndarray:
-        return fetch(_decode(*self._vae, latents))[: len(self._records)]
+        frames = _decode(*self._vae, latents)
+        return multihost_utils.process_allgather(frames, tiled=True)[: len(self._records)]
 
     @cached_property
     def _targets(self) -> np.ndarray:
@@ -276,10 +279,12 @@ class Samples:
         found = [record.arrays for record in self._records]
         size = -(-len(found) // parts("batch")) * parts("batch")
         where = batch_sharding(jax.sharding.get_mesh())
-        own = [found[row % len(found)] for row in process_rows(where, size)[jax.process_index()]]
-        return assemble(
-            {name: np.stack([row[name] for row in own]) for name in own[0]}, where, size
-        )
+        rows = list(islice(cycle(found), size))
+        arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+        return {
+            name: jax.make_array_from_callback(array.shape, where, array.__getitem__)
+            for name, array in arrays.items()
+        }
 
 
 def _names(records: Sequence[Record]) -> list[str]:
