@@ -10,7 +10,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -23,6 +23,7 @@ from jax.experimental import mesh_utils, multihost_utils
 from egosim_jax.generation.generator import Generator
 from egosim_jax.sharding import make_mesh
 from egosim_jax.testing import random_triplet
+from egosim_jax.train.config import OptimizerConfig
 from egosim_jax.train.distributed import distributed_context, free_local_address
 from egosim_jax.train.loop import Run, train
 from egosim_jax.train.monitor import Samples
@@ -51,6 +52,10 @@ class Case:
     """Number of gradient accumulation steps."""
     weights: str | None = None
     """Folder of a tiny model to train instead of a line; it has the weights of the autoencoder."""
+
+    @property
+    def config(self) -> MeshConfig:
+        return MeshConfig(**dict(zip(("data", "fsdp", "context"), self.mesh, strict=True)))
 
 
 @contextmanager
@@ -84,16 +89,19 @@ def run(case: Case, out: Path) -> None:
 
     settings: dict[str, Any] = {
         "steps": STEPS, "save_every": SAVE_EVERY, "keep": 5, "validate_every": STEPS,
-        "mesh": MeshConfig(*case.mesh), "grad_accum_steps": case.parts,
+        "mesh": case.config, "grad_accum_steps": case.parts,
     }  # fmt: skip
     task, samples, data = line.Line(), None, Path(case.data)
     if case.weights is not None:
         task, settings["sample_every"] = run_tiny.TASKS["egosim"], STEPS
         samples = Samples(model=run_tiny.MODEL, latents=data, vae=Path(case.weights), count=2)
+    training = line.training(**settings)
+    if case.weights is not None:  # Adam's first updates amplify gradients that are rounding errors
+        training = replace(training, optimizer=OptimizerConfig(learning_rate=1e-5))
     with arranged(case.order), patch.object(Run, "_to_devices", recorded):
         networks = train(
             task,
-            line.training(**settings),
+            training,
             data=data,
             validation=data,
             out=out / case.name,
@@ -110,7 +118,7 @@ def run(case: Case, out: Path) -> None:
 
 def generate(case: Case) -> dict[str, np.ndarray]:
     """Return the clips that a generator makes on the mesh of a case."""
-    model, mesh = run_tiny.MODEL, make_mesh(MeshConfig(*case.mesh))
+    model, mesh = run_tiny.MODEL, make_mesh(case.config)
     triplets = [random_triplet(model.video, seed) for seed in range(2)]
     generator = Generator.load(model, case.weights, mesh=mesh)
     return {"clips": np.stack([clip.frames for clip in generator.generate(triplets, [5, 6])])}

@@ -39,13 +39,13 @@ def alone(points, tmp_path_factory) -> Path:
     return out / "alone"
 
 
-def check(out: Path, alone: Path, *, first: int = 1) -> None:
+def check(out: Path, alone: Path, *, first: int = 1, atol: float = 1e-6) -> None:
     """Compare the run folder OUT with the run of one process, from update `first` on."""
     have, want = (dict(np.load(f"{folder}.npz")) for folder in (out, alone))
     # The first batch is the example that the update is compiled for.
     for name in have.keys() & {"record", "x"}:
         np.testing.assert_array_equal(have[name][1:], want[name][first:])
-    np.testing.assert_allclose(have["weights"], want["weights"], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(have["weights"], want["weights"], rtol=1e-6, atol=atol)
     logs = logged(out), logged(alone)
     assert [line.keys() for line in logs[0]] == [line.keys() for line in logs[1]]
     for mine, theirs in zip(*logs, strict=True):
@@ -135,7 +135,7 @@ def test_two_processes_that_share_clips_train_sample_and_generate_as_one(tmp_pat
     run(Case("alone", **shared), tmp_path)
     case = Case("context", mesh=(1, 2, 2), order="interleaved", **shared)
     launch(tmp_path, [case], processes=2, devices=2)
-    check(tmp_path / "context", tmp_path / "alone")
+    check(tmp_path / "context", tmp_path / "alone", atol=2 * STEPS * 1e-5)
     clips = [np.load(tmp_path / f"{name}.npz")["clips"] for name in ("context", "alone")]
     assert np.abs(np.subtract(*clips, dtype=int)).max() <= 1
     clips = [
