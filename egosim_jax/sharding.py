@@ -11,17 +11,22 @@ two tables here map logical axes to mesh axes.
 
 Weights, gradients and optimizer state are split over fsdp and context together, along the model
 width.
+
+The devices of a process may have any places in the mesh, so its rows of a batch may be any rows
+(`process_rows`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from bisect import bisect_left
+from collections.abc import Iterable, Mapping, Sequence
 from math import prod
 from typing import Any, TypeVar
 
 import jax
+import numpy as np
 from flax import nnx
-from jax.experimental import mesh_utils
+from jax.experimental import mesh_utils, multihost_utils
 from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding, PartitionSpec
 
 from egosim_jax.types import InputError, MeshConfig
@@ -116,6 +121,68 @@ def parts(axis: str, mesh: Mesh | AbstractMesh | None = None) -> int:
 def batch_sharding(mesh: Mesh) -> NamedSharding:
     """Return the sharding of arrays with a leading batch axis."""
     return NamedSharding(mesh, spec("batch"))
+
+
+def process_rows(sharding: NamedSharding, size: int) -> dict[int, tuple[int, ...]]:
+    """Return the rows of a batch that each process holds, ascending, by index of the process.
+
+    These are the rows of its devices, wherever the mesh has them: on TPU slices they are often not
+    consecutive. Processes whose devices share samples hold the same rows.
+    """
+    held: dict[int, list[Any]] = {}
+    for device, index in sharding.devices_indices_map((size,)).items():
+        held.setdefault(device.process_index, []).append(index)
+    return {process: _rows(held[process], size) for process in sorted(held)}
+
+
+def row_groups(rows: Mapping[int, tuple[int, ...]]) -> dict[tuple[int, ...], list[int]]:
+    """Return the processes that hold the same rows, by these rows."""
+    groups: dict[tuple[int, ...], list[int]] = {}
+    for process, own in rows.items():
+        groups.setdefault(own, []).append(process)
+    return groups
+
+
+def assemble(
+    rows: Mapping[str, np.ndarray], sharding: NamedSharding, size: int
+) -> dict[str, jax.Array]:
+    """Return a global batch of `size` rows from this process's rows of it (`process_rows`).
+
+    All processes call it. Row r of the batch is row r, whatever process and device hold it.
+    """
+    own = _rows(sharding.addressable_devices_indices_map((size,)).values(), size)
+
+    def place(name: str, value: np.ndarray) -> jax.Array:
+        if len(value) != len(own):
+            raise ValueError(
+                f"{name} has {len(value)} rows; this process holds the {len(own)} rows {own} of a "
+                f"batch of {size}."
+            )
+
+        def part(index: tuple[slice, ...]) -> np.ndarray:
+            # A device holds consecutive rows, so they are consecutive among the process's rows.
+            wanted = range(size)[index[0]]
+            first = bisect_left(own, wanted[0])
+            return value[first : first + len(wanted)]
+
+        return jax.make_array_from_callback((size, *value.shape[1:]), sharding, part)
+
+    return {name: place(name, value) for name, value in rows.items()}
+
+
+def fetch(array: jax.Array) -> np.ndarray:
+    """Return a whole array, on every process.
+
+    All processes that hold a part of it call this.
+    """
+    if array.is_fully_addressable:
+        return np.asarray(array)
+    return multihost_utils.process_allgather(array, tiled=True)
+
+
+def _rows(indices: Iterable[Any], size: int) -> tuple[int, ...]:
+    """Return the rows of the indices of a sharding's devices, ascending."""
+    return tuple(sorted({row for index in indices for row in range(size)[index[0]]}))
 
 
 def state_sharding(mesh: Mesh | AbstractMesh, tree: Any) -> Any:

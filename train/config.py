@@ -120,9 +120,7 @@ class TrainConfig:
     fallback: bool = False
     """If the newest checkpoint is damaged, resume from the previous one."""
     workers: int = 0
-    """Number of processes that load data; 0: threads of the training process.
-
-    It determines the data order, so a resumed run needs the same number."""
+    """Number of processes that load data; 0: threads of the training process."""
     hang_timeout_s: float = 300.0
     """Minimum seconds without a finished update before a run exits with code 70.
 
@@ -148,7 +146,7 @@ class TrainConfig:
 
 RESUME_MUTABLE = (
     "mesh", "grad_accum_steps", "log_every", "save_every", "validate_every", "sample_every", "keep",
-    "keep_every", "fallback", "hang_timeout_s", "tensorboard", "wandb",
+    "keep_every", "fallback", "workers", "hang_timeout_s", "tensorboard", "wandb",
 )  # fmt: skip
 """Fields of `TrainConfig` that may change on resume: they do not affect the result."""
 

@@ -31,7 +31,7 @@ from egosim_jax.io.run import open_folder, write_json
 from egosim_jax.io.weights import hashes, place
 from egosim_jax.models.layers import LowRankParam, init_sharded
 from egosim_jax.runtime.command import CommandExit, ExitCode
-from egosim_jax.sharding import batch_sharding, make_mesh, parts
+from egosim_jax.sharding import assemble, batch_sharding, make_mesh, parts, process_rows
 from egosim_jax.train.config import TrainConfig, learning_rate, numerics_only, resume_mutable
 from egosim_jax.train.distributed import is_preempted
 from egosim_jax.train.metric_writers import Console, JsonLines, TensorBoard, WandB, Writer
@@ -215,8 +215,7 @@ class Run:
             source, params = open_shards(shards), state.eval_params
             batches = validation_batches(source, self.task, self.training, self.sharding)
             metrics, readable = mean_validation(
-                self.programs.validate(params, self.frozen, self._to_devices(batch))
-                for batch in batches
+                self.programs.validate(params, self.frozen, batch) for batch in batches
             )
         if (bad := len(source) - readable) > Loader.MAX_BAD:  # summed over all processes
             raise InputError(
@@ -285,10 +284,7 @@ class Run:
         return jax.jit(create, out_shardings=sharding, donate_argnums=0)(loaded)
 
     def _to_devices(self, batch: Mapping[str, np.ndarray]) -> dict[str, jax.Array]:
-        return {
-            name: jax.make_array_from_process_local_data(self.sharding, value)
-            for name, value in batch.items()
-        }
+        return assemble(batch, self.sharding, self.training.batch_size)
 
 
 def make_batches(
@@ -299,17 +295,15 @@ def make_batches(
     *,
     peek: bool = False,
 ) -> Loader:
-    """Return an iterator over this process's shard of each batch, shuffled and endless.
+    """Return an iterator over this process's rows of each batch, shuffled and endless.
 
     With `peek` it starts no worker processes.
     """
-    index, count = process_shard(sharding, training.batch_size)
     return make_loader(
         source,
         batch_size=training.batch_size,
         seed=training.seed,
-        process_index=index,
-        process_count=count,
+        rows=process_rows(sharding, training.batch_size)[jax.process_index()],
         workers=0 if peek else training.workers,
         transform=task.examples(),
     )
@@ -317,31 +311,13 @@ def make_batches(
 
 def validation_batches(
     source: ShardReader | Mixture, task: Task, training: TrainConfig, sharding: Any
-) -> Iterator[dict[str, np.ndarray]]:
-    """Return this process's shard of each batch of one pass over all records."""
+) -> Iterator[dict[str, jax.Array]]:
+    """Yield the batches of one pass over all records, on the devices of all processes."""
     devices = parts("batch", sharding.mesh)
     size = min(training.batch_size, -(-len(source) // devices) * devices)
-    index, count = process_shard(sharding, size)
-    return one_pass(
-        source,
-        batch_size=size,
-        process_index=index,
-        process_count=count,
-        transform=task.examples(),
-    )
-
-
-def process_shard(sharding: Any, size: int) -> tuple[int, int]:
-    """Return the index of this process's shard of a batch, and the number of shards.
-
-    Processes along the context axis share samples, so they have the same shard.
-    """
-    rows = {
-        index[0].indices(size)[:2]
-        for index in sharding.addressable_devices_indices_map((size,)).values()
-    }
-    first, end = min(rows)[0], max(rows)[1]
-    return first // (end - first), size // (end - first)
+    rows = process_rows(sharding, size)[jax.process_index()]
+    for batch in one_pass(source, batch_size=size, rows=rows, transform=task.examples()):
+        yield assemble(batch, sharding, size)
 
 
 def make_writers(training: TrainConfig, out: Path, step: int) -> list[Writer]:

@@ -11,7 +11,8 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -21,7 +22,14 @@ from egosim_jax.preflight.report import OutOfMemory, Report, compile_for, plain,
 from egosim_jax.preflight.targets import Target, find
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.runtime.progress import track
-from egosim_jax.sharding import batch_sharding, make_mesh, parts
+from egosim_jax.sharding import (
+    batch_sharding,
+    check_batch,
+    make_mesh,
+    parts,
+    process_rows,
+    row_groups,
+)
 from egosim_jax.train.tasks.denoising import Denoising
 from egosim_jax.train.update import Programs, Stage
 from egosim_jax.types import MeshConfig
@@ -43,16 +51,31 @@ class Setting:
     """Number of devices that share a clip."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Host:
+    """A host of a target, which runs one process of a training."""
+
+    host: int
+    """Index of the host."""
+    devices: int
+    """Number of its devices."""
+    rows: tuple[int, ...]
+    """Rows of each batch that its devices hold, which its process reads."""
+
+
 def preflight(stages: Mapping[str, Stage], name: str, *, as_json: bool, search: bool) -> int:
     """Print the report of each stage of a recipe on a target; return 1 if one does not fit."""
     target, fit = find(name), True
     found: dict[str, dict[str, Any]] = {}
     for title, stage in stages.items():
+        hosts = hosts_of(stage, target)
+        if not as_json:
+            print(f"{_heading(title, stage, target)}\n\n{_rows(hosts)}\n", flush=True)
         report = compile_step(stage, target)
         fit &= report.fits
-        found[title] = {"asked": plain(report)}
+        found[title] = {"hosts": [asdict(host) for host in hosts], "asked": plain(report)}
         if not as_json:
-            print(f"{_heading(title, stage, target)}\n\n{text(report)}", flush=True)
+            print(text(report), flush=True)
         # Settings are ordered by predicted speed, so a search needs the device's peak.
         known_speed = not math.isnan(target.device.flops)
         if search and isinstance(stage.task, Denoising) and known_speed:
@@ -66,6 +89,16 @@ def preflight(stages: Mapping[str, Stage], name: str, *, as_json: bool, search: 
     if as_json:
         print(json.dumps(found, indent=2))
     return ExitCode.DONE if fit else ExitCode.FAILED
+
+
+def hosts_of(stage: Stage, target: Target) -> list[Host]:
+    """Return the hosts of a target. Raises `InputError` if the target does not fit the mesh."""
+    training = stage.training
+    mesh = make_mesh(training.mesh, target.devices)
+    check_batch(training.batch_size, mesh, training.grad_accum_steps)
+    devices = Counter(device.process_index for device in target.devices)
+    rows = process_rows(batch_sharding(mesh), training.batch_size)
+    return [Host(host=host, devices=devices[host], rows=rows[host]) for host in rows]
 
 
 def compile_step(stage: Stage, target: Target) -> Report | OutOfMemory:
@@ -146,6 +179,29 @@ def _heading(title: str, stage: Stage, target: Target) -> str:
     return (
         f"{title} on {target.name}, {len(target.devices)} x {device}{shared}: batch "
         f"{stage.training.batch_size}, {setting.clips} on a device at a time, remat {setting.remat}"
+    )
+
+
+def _rows(hosts: Sequence[Host]) -> str:
+    """Format the rows of each host; a line for all hosts with the same rows."""
+    groups = row_groups({host.host: host.rows for host in hosts})
+    named = {_ranges(group): _ranges(rows) for rows, group in groups.items()}
+    width = max(map(len, named)) + 2
+    lines = [f"    {group:<{width}}{rows}" for group, rows in named.items()]
+    each = ", ".join(sorted({str(host.devices) for host in hosts}))
+    return "\n".join([f"  rows of the batch by host, {each} devices each", *lines])
+
+
+def _ranges(numbers: Sequence[int]) -> str:
+    """Format ascending numbers: `0, 1, 6 to 9`."""
+    spans: list[list[int]] = []
+    for number in numbers:
+        if spans and number == spans[-1][-1] + 1:
+            spans[-1].append(number)
+        else:
+            spans.append([number])
+    return ", ".join(
+        f"{span[0]} to {span[-1]}" if len(span) > 2 else ", ".join(map(str, span)) for span in spans
     )
 
 

@@ -2,11 +2,13 @@
 
 The loader iterates over one endless sequence of records that depends on the seed alone: every epoch
 is a new permutation, and position k of the sequence has its own random numbers for its window.
-Process p of n takes positions p, p + n, p + 2n, ..., so that global batch b holds the same
-positions for any number of processes. Worker processes share the positions in the same order.
+Row r of batch b is position b * batch size + r, for any number of processes, of worker processes
+and any mesh. A process reads the rows that its devices hold (`sharding.process_rows`). So a saved
+position is a number of batches.
 
-A record that cannot be read is skipped, counted in `Loader.skipped` under its file and position,
-and replaced by the next one. More than `Loader.MAX_BAD` different bad records stop the run.
+The example of a record that cannot be read is replaced by the one of the next position, which any
+process can do alone. The record is counted in `Loader.skipped` under its file and position. More
+than `Loader.MAX_BAD` different bad records stop the run.
 
 For validation, `one_pass` yields every record once, in order, with weight 1. Fillers of weight 0
 complete the batches, so that all processes get the same number of batches.
@@ -18,8 +20,9 @@ stretch of the sequence therefore has the proportions of the weights.
 from __future__ import annotations
 
 import logging
+import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
@@ -52,72 +55,67 @@ def make_loader(
     *,
     batch_size: int,
     seed: int,
-    process_index: int = 0,
-    process_count: int = 1,
+    rows: Sequence[int] | None = None,
     workers: int = 0,
     shuffle: bool = True,
     transform: Transform = None,
 ) -> Loader:
-    """Return an iterator over this process's examples of each batch.
+    """Return an iterator over the examples of some rows of each batch, by default of all.
 
-    A process gets `batch_size / process_count` examples of each batch. `transform` maps a record's
-    arrays to an example, with random numbers if it is a `RandomMap`; examples also get `record`,
-    their index in the source. `workers` processes prepare examples; 0 prepares them in threads of
-    this process.
+    `transform` maps a record's arrays to an example, with random numbers if it is a `RandomMap`;
+    examples also get `record`, their index in the source. `workers` processes prepare examples; 0
+    prepares them in threads of this process.
     """
-    if batch_size < 1 or batch_size % process_count:
-        raise InputError(
-            f"A batch of {batch_size} cannot be shared by {process_count} processes: it must be a "
-            "multiple of their number. (--batch-size)"
-        )
+    rows = _checked(rows, batch_size)
     mixed = isinstance(source, Mixture)
     if isinstance(source, Mixture):
         positions = _mixed(source, seed, shuffle)
     else:
         positions = _positions(source, seed, shuffle).repeat()
     examples = positions.random_map(_Read(source, transform), seed=seed if mixed else None)
-    stream = examples[process_index::process_count].to_iter_dataset(_READING)
-    if workers:
-        flags.FLAGS.mark_as_parsed()
-        stream = stream.mp_prefetch(grain.MultiprocessingOptions(num_workers=workers))
     skipped: Counter[str] = Counter()
-    batches = stream.filter(_Healthy(skipped)).batch(
-        batch_size // process_count, drop_remainder=True
-    )
+
+    def open_at(batch: int) -> grain.DatasetIterator:
+        own = grain.MapDataset.range(batch * len(rows), sys.maxsize // batch_size)
+        read = own.map(_Row(examples, rows, batch_size)).to_iter_dataset(_READING)
+        if workers:
+            flags.FLAGS.mark_as_parsed()
+            read = read.mp_prefetch(grain.MultiprocessingOptions(num_workers=workers))
+        return iter(read.map(_Count(skipped)).batch(len(rows), drop_remainder=True))
+
     contract = {
         "data": source.manifest.fingerprint,
         "batch_size": batch_size,
         "seed": seed,
-        "process_index": process_index,
-        "process_count": process_count,
-        "workers": workers,
         "shuffle": shuffle,
     }
     if isinstance(source, Mixture):
         contract["weights"] = list(source.weights)
-    return Loader(iter(batches), contract, skipped)
+    return Loader(open_at, contract, skipped)
 
 
 def one_pass(
     source: ShardReader | Mixture,
     *,
     batch_size: int,
-    process_index: int = 0,
-    process_count: int = 1,
+    rows: Sequence[int] | None = None,
     transform: Transform = None,
 ) -> Iterator[dict[str, np.ndarray]]:
-    """Yield this process's examples of each batch of one pass, in order, with their `weight`.
+    """Yield the examples of some rows of each batch of one pass, in order, with their `weight`.
 
     Every readable record occurs once with weight 1. A copy of one readable record, with weight 0
     and the same on all processes, replaces bad records and completes the last batch. Raises
     `InputError` if none of the first records can be read.
     """
+    rows = _checked(rows, batch_size)
     examples = _positions(source, 0, shuffle=False).random_map(_Read(source, transform))
     filler = _first_readable(examples, source)
-    own = batch_size // process_count
-    with closing(iter(examples[process_index::process_count].to_iter_dataset(_READING))) as stream:
-        for _ in range(0, len(source), batch_size):
-            read = [next(stream, None) for _ in range(own)]
+    firsts = range(0, len(source), batch_size)
+    own = [first + row for first in firsts for row in rows if first + row < len(source)]
+    chosen = grain.MapDataset.source(own).map(examples.__getitem__).to_iter_dataset(_READING)
+    with closing(iter(chosen)) as stream:
+        for _ in firsts:
+            read = [next(stream, None) for _ in rows]
             for bad in read:
                 if isinstance(bad, _Bad):
                     logger.warning("skipping %s", printable(bad.message))
@@ -125,6 +123,17 @@ def one_pass(
             batch = {name: np.stack([example[name] for example in kept]) for name in filler}
             weight = [isinstance(example, dict) for example in read]
             yield {**batch, "weight": np.array(weight, np.float32)}
+
+
+def _checked(rows: Sequence[int] | None, batch_size: int) -> Sequence[int]:
+    """Return the rows, by default all. Raises `InputError` unless they ascend within the batch."""
+    rows = range(batch_size) if rows is None else rows
+    if not rows or list(rows) != sorted(set(rows)) or not 0 <= rows[0] <= rows[-1] < batch_size:
+        raise InputError(
+            f"A batch of {batch_size} has no rows {listing(list(map(str, rows)))}: give at least "
+            f"one row, in ascending order, from 0 to {batch_size - 1}. (--batch-size)"
+        )
+    return rows
 
 
 def _first_readable(
@@ -161,7 +170,7 @@ def _mixed(source: Mixture, seed: int, shuffle: bool) -> grain.MapDataset:
     return grain.MapDataset.mix(passes, list(source.weights))
 
 
-class Loader(grain.DatasetIterator):
+class Loader:
     """An iterator over batches, whose state is saved in checkpoints along with the weights.
 
     `skipped` counts the bad records so far, by name. `set_state` raises `InputError` if the state
@@ -173,23 +182,32 @@ class Loader(grain.DatasetIterator):
 
     def __init__(
         self,
-        batches: grain.DatasetIterator,
+        open_at: Callable[[int], grain.DatasetIterator],
         contract: Mapping[str, Any],
         skipped: Counter[str],
     ):
-        super().__init__(batches)
+        """`open_at` returns an iterator that begins at a batch."""
         self.contract, self.skipped = dict(contract), skipped
-        self._batches = batches
+        self._open_at, self._read = open_at, 0
+        self._batches = open_at(0)
+
+    def __iter__(self) -> Loader:
+        return self
 
     def __next__(self) -> dict[str, np.ndarray]:
-        return next(self._batches)
+        batch = next(self._batches)
+        self._read += 1
+        return batch
 
     def get_state(self) -> dict[str, Any]:
-        """Return the position and all settings that determine the sequence, as JSON values."""
-        return {"contract": self.contract, "position": self._batches.get_state()}
+        """Return the number of batches read and all settings that determine them, as JSON values.
+
+        It is the same on all processes.
+        """
+        return {"contract": self.contract, "batches": self._read}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Continue from a state of `get_state`."""
+        """Continue from a state of `get_state`, also of a loader of other rows or workers."""
         saved = state["contract"]
         differing = [
             f"{name}: the state has {saved.get(name)}, this loader {value}"
@@ -200,7 +218,13 @@ class Loader(grain.DatasetIterator):
             raise InputError(
                 f"The saved data position is of another sequence: {listing(differing)}."
             )
-        self._batches.set_state(state["position"])
+        self.close()
+        self._read = state["batches"]
+        self._batches = self._open_at(self._read)
+
+    def close(self) -> None:
+        """End the threads and worker processes."""
+        self._batches.close()
 
 
 def _check(arrays: Example, manifest: Manifest) -> None:
@@ -254,18 +278,40 @@ class _Read(grain.transforms.RandomMap):
 
 
 @dataclass(frozen=True)
-class _Healthy(grain.transforms.Filter):
-    """A filter that drops and counts bad records, and stops the run after too many."""
+class _Row(grain.transforms.Map):
+    """A transform from the index of an example of some rows of all batches to the example.
+
+    It returns bad records before the example, too, and no example after too many.
+    """
+
+    examples: grain.MapDataset
+    rows: Sequence[int]
+    batch_size: int
+
+    def map(self, element: int) -> tuple[Any, list[_Bad]]:
+        """Return the first example that can be read from the row's position on."""
+        batch, row = divmod(element, len(self.rows))
+        position, bad = batch * self.batch_size + self.rows[row], []
+        while isinstance(example := self.examples[position + len(bad)], _Bad):
+            bad.append(example)
+            if len(bad) > Loader.MAX_BAD:
+                return None, bad
+        return example, bad
+
+
+@dataclass(frozen=True)
+class _Count(grain.transforms.Map):
+    """A transform that counts the bad records before an example; too many stop the run."""
 
     skipped: Counter[str]
 
-    def filter(self, element: Any) -> bool:
-        """Return True for an example, False for a placeholder."""
-        if not isinstance(element, _Bad):
-            return True
-        if element.message not in self.skipped:
-            logger.warning("skipping %s", printable(element.message))
-        self.skipped[element.message] += 1
-        if len(self.skipped) > Loader.MAX_BAD:
+    def map(self, element: tuple[Any, list[_Bad]]) -> Any:
+        """Return the example."""
+        example, bad = element
+        for message in (record.message for record in bad):
+            if message not in self.skipped:
+                logger.warning("skipping %s", printable(message))
+            self.skipped[message] += 1
+        if example is None or len(self.skipped) > Loader.MAX_BAD:
             raise InputError(f"Too many records cannot be read: {listing(list(self.skipped))}")
-        return False
+        return example

@@ -9,7 +9,8 @@ scan. The noise is donated. An item's noise depends only on its seed, so a clip 
 its batch.
 
 On a mesh (`sharding.py`), data x fsdp splits the batch. Devices along context share the denoising
-of a clip; each of them encodes and decodes the complete clip.
+of a clip; each of them encodes and decodes the complete clip. If the devices belong to several
+processes, all of them make the same calls and get all clips.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.run import plain
 from egosim_jax.models import Denoiser
 from egosim_jax.rendering import Renderer, jitted
-from egosim_jax.sharding import shard_params
+from egosim_jax.sharding import fetch, shard_params
 from egosim_jax.types import (
     Action,
     Clip,
@@ -234,7 +235,7 @@ class Generator:
             condition = condition.drop(without)
         step_seeds = self._step_seeds(last_32_bits(seeds))
         latents = self._denoise(condition, self.noise(seeds), *step_seeds)
-        bad = [n for n, latent in enumerate(np.asarray(latents)) if not np.isfinite(latent).all()]
+        bad = [n for n, latent in enumerate(fetch(latents)) if not np.isfinite(latent).all()]
         if bad:
             raise NonFiniteError([triplet.video_id for triplet in triplets], bad)
         return latents
@@ -304,7 +305,7 @@ class Generator:
         return (seeds,) if self.config.solver.stochastic else ()
 
     def _clips(self, latents: Float[Array, "b f h w z"]) -> list[Clip]:
-        frames = np.asarray(self._decode(latents))
+        frames = fetch(self._decode(latents))
         return [Clip(frames=video, fps=self.config.video.fps) for video in frames]
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Awaitable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -27,6 +27,8 @@ from egosim_jax.io.run import write_json
 from egosim_jax.types import InputError
 
 STATE, DATA = "state", "data"
+POSITION = "position.json"
+"""File in the folder of the data with the position of its iterator."""
 HASHES = "sha256.json"
 """File in a checkpoint's folder with the hashes of all its other files."""
 
@@ -99,7 +101,7 @@ class Checkpoints:
         """
         self.wait()
         with self._explained(step):
-            saved = {STATE: state, DATA: data}
+            saved = {STATE: state, DATA: _Position(data)}
             response = self._checkpointer.save_checkpointables_async(step, saved)
         if response is not None:
             self._saving = step, self._thread.submit(self._seal, step, response)
@@ -207,7 +209,8 @@ class Checkpoints:
     def _load(self, step: int, state: Any, data: Any) -> Any:
         try:
             self._check_shapes(step, self._checkpointer.metadata(step).metadata, state)
-            loaded = self._checkpointer.load_checkpointables(step, {STATE: state, DATA: data})
+            wanted = {STATE: state, DATA: _Position(data)}
+            loaded = self._checkpointer.load_checkpointables(step, wanted)
         except InputError:
             raise
         except Exception as error:
@@ -236,6 +239,35 @@ class Checkpoints:
                 f"The checkpoint of step {step} in {self.folder} was made by another model or "
                 f"optimizer. Use its config, or another --out: {listing(problems)}."
             )
+
+
+class _Position:
+    """Position of a data iterator, the same on all processes: the first one writes it.
+
+    Orbax saves and loads any object with these two methods in its own folder.
+    """
+
+    def __init__(self, data: Any):
+        self.data = data
+
+    async def save(self, directory: Any) -> Awaitable[None]:
+        """Return the writing of the present position."""
+        position = self.data.get_state()
+
+        async def write() -> None:
+            folder = await directory.await_creation()
+            if jax.process_index() == 0:
+                write_json(Path(folder) / POSITION, position)
+
+        return write()
+
+    async def load(self, directory: Any) -> Awaitable[None]:
+        """Return the reading of a saved position into the iterator."""
+
+        async def read() -> None:
+            self.data.set_state(read_json(Path(directory) / POSITION))
+
+        return read()
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:

@@ -7,6 +7,7 @@ TPU slice by its name, and a GPU by the properties that its driver would report.
 from __future__ import annotations
 
 import difflib
+import math
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -133,6 +134,8 @@ OFFLINE_ENV = {
     "ALLOW_MULTIPLE_LIBTPU_LOAD": "1",
 }
 """Environment variables that stop the compilers from looking for a driver, TPU host or lock."""
+GPU_HOST = 8
+"""Maximum number of GPUs of a host: hosts of more GPUs have equal numbers, such as 9 x 8."""
 GPU_SHARE = 0.95
 """Share of a GPU's memory that XLA may allocate, with the settings of docs/train.md."""
 
@@ -233,11 +236,12 @@ def _gpus(device: Device, chip: Chip, count: int) -> Sequence[Any]:
             "The compiler for NVIDIA GPUs is not installed; it needs no GPU: "
             "pip install 'egosim-jax[cuda]'"
         )
+    each = count if count <= GPU_HOST else math.gcd(count, GPU_HOST)
     return topologies.get_topology_desc(
         platform="cuda",
         topology_name=device.kind,
         target_config=_properties(device, chip),
-        topology=f"1x1x{count}",
+        topology=f"1x{count // each}x{each}",
     ).devices
 
 

@@ -51,6 +51,7 @@ def test_a_recipe_is_compiled_without_any_file(tmp_path, monkeypatch, capsys):
     printed = capsys.readouterr().out
     assert "vae on cpu:1, 1 x cpu: batch 2" in printed
     assert "denoiser on cpu:1, 1 x cpu: batch 2" in printed
+    assert printed.count("rows of the batch by host, 1 devices each\n    0  0, 1\n") == 2
     assert printed.count(": fits") == 2
     assert not list(tmp_path.iterdir())
 
@@ -58,7 +59,9 @@ def test_a_recipe_is_compiled_without_any_file(tmp_path, monkeypatch, capsys):
 @pytest.mark.usefixtures("small")
 def test_json_has_the_memory_and_what_does_not_fit_ends_with_1(capsys):
     assert egosim_train(["debug", "--preflight", "cpu:1", "--json"]) == 1
-    report = json.loads(capsys.readouterr().out)["denoiser"]["asked"]
+    printed = json.loads(capsys.readouterr().out)["denoiser"]
+    assert printed["hosts"] == [{"host": 0, "devices": 1, "rows": [0, 1]}]
+    report = printed["asked"]
     assert not report["fits"]
     assert report["peak"] == sum(report["memory"].values()) > report["capacity"] == 1e6
     assert report["hardware_flops"] > report["model_flops"] > 0

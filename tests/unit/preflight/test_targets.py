@@ -19,6 +19,7 @@ from egosim_jax.preflight.targets import (
     peak,
 )
 from egosim_jax.types import InputError
+from tests.machines import MACHINES
 
 
 @pytest.mark.parametrize("name", ["h200:8", "h100:1", "b200:8", "v5p:2x2x2", "v6e:4x4", "cpu:1"])
@@ -101,8 +102,8 @@ def test_another_error_of_a_compiler_stays_one():
 
 
 COMPILERS = {
-    "jax_cuda13_plugin": {"h200:8": 8, "b200:1": 1},
-    "libtpu": {"v5p:2x2x2": 8, "v6e:4x4": 16},
+    "jax_cuda13_plugin": {"h200:8": 8, "b200:1": 1, "h200:16": 16, "b200:72": 72},
+    "libtpu": {"v5p:2x2x2": 8, "v6e:4x4": 16, "v5e:4x4": 16, "v5e:8x8": 64, "v5p:4x4x4": 64},
 }
 INSTALLED = [c for module, c in COMPILERS.items() if importlib.util.find_spec(module)]
 
@@ -116,3 +117,7 @@ def test_a_target_has_its_devices(name, devices):
     target = find(name)
     assert len(target.devices) == devices
     assert all(device.device_kind.startswith(target.device.kind) for device in target.devices)
+    if (imitated := MACHINES.get(name)) is not None:
+        for real, ours in zip(target.devices, imitated, strict=True):
+            assert (real.id, real.process_index) == (ours.id, ours.process_index)
+            assert ours.platform == "gpu" or tuple(real.coords) == ours.coords
