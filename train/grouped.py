@@ -48,7 +48,7 @@ def grouped(
     """Return `inner` on the groups of a tree of nnx variables.
 
     `dimensions` returns the axes of a matrix `[n?, ..., in, out]`, else None. The state of `inner`
-    groups' shapes and is replicated on a mesh.
+    has the groups' shapes and is replicated on a mesh.
     """
 
     def init(params: Any) -> Any:
