@@ -6,6 +6,6 @@ processes ─clips▶ encoder ─latents▶ pool ─batches▶ denoiser
 scenes    clips without end, by seed, and the process that makes them
 pool      what the updates draw from, on the accelerator
 denoiser  its updates, several in one program
-decoder   updates of the VAE's decoder while it trains; its encoder stays, so that latents stay valid
+decoder   updates of the decoder of the VAE; its encoder stays, so that latents stay valid
 run       the loop, its schedule, logs and weights
 """
