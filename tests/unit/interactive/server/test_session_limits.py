@@ -1,4 +1,4 @@
-"""What a session refuses: invalid starts and actions, and more than its limits."""
+"""Refusals of sessions: invalid starts and actions, and more than the limits."""
 
 import numpy as np
 import pytest
