@@ -23,7 +23,7 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_shows_no_secret_and_listens_nowhere(name, tmp_path):
+def test_a_command_reveals_no_secret_and_listens_nowhere(name, tmp_path):
     said = tmp_path / "said"
     with said.open("wb") as log:
         process = subprocess.Popen(

@@ -1,4 +1,4 @@
-"""Refusals of sessions: invalid starts and actions, and more than their limits."""
+"""Refusals of sessions: invalid starts and actions, and more than the limits."""
 
 import numpy as np
 import pytest
