@@ -130,8 +130,8 @@ def _checked(rows: Sequence[int] | None, batch_size: int) -> Sequence[int]:
     rows = range(batch_size) if rows is None else rows
     if not rows or list(rows) != sorted(set(rows)) or not 0 <= rows[0] <= rows[-1] < batch_size:
         raise InputError(
-            f"A batch of {batch_size} has no rows {listing(list(map(str, rows)))}: give at least "
-            f"one row, in ascending order, from 0 to {batch_size - 1}. (--batch-size)"
+            f"A batch of {batch_size} has no rows {list(rows)}: give at least one row, in "
+            f"ascending order, from 0 to {batch_size - 1}. (--batch-size)"
         )
     return rows
 
