@@ -159,7 +159,7 @@ def assemble(
                 f"batch of {size}."
             )
 
-        def part(index: tuple[slice, ...]) -> np.ndarray:
+        def part(index: Any) -> np.ndarray:
             # A device holds consecutive rows, so they are consecutive among the process's rows.
             wanted = range(size)[index[0]]
             first = bisect_left(own, wanted[0])

@@ -58,13 +58,14 @@ def grouped(
         if params is None:
             raise ValueError("grouped transformations need the weights, for their axes")
         plan = _plan(params, dimensions)
-        packed, state = inner.update(_pack(updates, plan), state, _pack(params, plan))
+        packed: Any = _pack(updates, plan)
+        packed, state = inner.update(packed, state, _pack(params, plan))
         return _unpack(packed, updates, plan), state
 
     return optax.GradientTransformation(init, update)
 
 
-def group_dimensions(groups: Mapping[str, jax.Array]) -> dict[str, MuonDimensionNumbers | None]:
+def group_dimensions(groups: Any) -> Any:
     """Return Muon's axes of each group: rows and columns of its stacked matrices."""
     return {name: None if name == OTHERS else MuonDimensionNumbers((1,), 2) for name in groups}
 
@@ -78,11 +79,18 @@ def _plan(params: Any, dimensions: Dimensions) -> dict[str, list[Member]]:
         if axes is None:
             groups.setdefault(OTHERS, []).append(Member(index, prod(shape), 1, False))
             continue
-        rows, columns = prod(shape[a] for a in axes.reduction_axis), shape[axes.output_axis]
+        columns = shape[-1]
+        count = prod(shape[: _first(axes)])
+        rows = prod(shape[_first(axes) : -1])
         name = f"{min(rows, columns)}x{max(rows, columns)}"
-        count = prod(shape) // (rows * columns)
         groups.setdefault(name, []).append(Member(index, count, rows, rows > columns))
     return groups
+
+
+def _first(axes: MuonDimensionNumbers) -> int:
+    """Return the first axis of a matrix's rows."""
+    rows = axes.reduction_axis
+    return rows if isinstance(rows, int) else min(rows)
 
 
 def _pack(tree: Any, plan: Mapping[str, list[Member]]) -> dict[str, jax.Array]:

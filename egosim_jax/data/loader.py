@@ -288,7 +288,7 @@ class _Row(grain.transforms.Map):
     rows: Sequence[int]
     batch_size: int
 
-    def map(self, element: int) -> tuple[Any, list[_Bad]]:
+    def map(self, element: int) -> Any:
         """Return the first example that can be read from the row's position on."""
         batch, row = divmod(element, len(self.rows))
         position, bad = batch * self.batch_size + self.rows[row], []

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -20,6 +21,7 @@ from egosim_jax import configs
 from egosim_jax.runtime.command import ExitCode, run_with_exit_codes
 from egosim_jax.train.online.plan import OnlineTraining
 from egosim_jax.train.online.run import OnlineRun
+from egosim_jax.types import InputError
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -40,11 +42,13 @@ def main(args: Sequence[str] | None = None) -> int:
     def run() -> int:
         gpu = jax.default_backend() == "gpu"
         model = configs.get(options.pop("config"))
-        layers = options.pop("layers") or model.dit.layers
-        dit = replace(model.dit, layers=layers, remat="none")
+        shape: Any = model.dit
+        dit = replace(shape, layers=options.pop("layers") or shape.layers, remat="none")
         if gpu:  # jax's cuDNN kernel has a backward pass, "auto" one for inference
             dit = replace(dit, dtype="bfloat16", products=None, attention="cudnn")
         start = options.pop("weights") or configs.shipped_weights(model.name)
+        if start is None:
+            raise InputError(f"{model.name} has no weights of its own: give some. (--weights)")
         plan = OnlineTraining(model=replace(model, dit=dit), start=start, **options)
         OnlineRun(plan).train()
         return ExitCode.DONE

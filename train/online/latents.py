@@ -114,6 +114,8 @@ def main(args: Sequence[str] | None = None) -> None:
     parser.add_argument("--scenes", type=int, default=10**9, help="number of scenes")
     options = parser.parse_args(args)
     weights = options.weights or configs.shipped_weights(options.config)
+    if weights is None:
+        parser.error(f"{options.config} has no weights of its own: give some with --weights")
     began = time.monotonic()
     for made in make_latents(
         configs.get(options.config),

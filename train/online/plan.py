@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.configs.model import ModelConfig
@@ -70,6 +71,12 @@ class OnlineTraining:
     """Seconds between validations."""
     save_s: float = 120.0
     """Seconds between writings of the weights."""
+
+    @property
+    def layers(self) -> int:
+        """Number of the denoiser's blocks."""
+        dit: Any = self.model.dit
+        return dit.layers
 
     @property
     def denoising(self) -> Denoising:

@@ -57,12 +57,15 @@ class OnlineRun:
         plan.out.mkdir(parents=True, exist_ok=True)
         self.log = JsonLines(plan.out / "metrics.jsonl", resume_after=0)
         model = plan.model
-        start = deepen_weights(plan.start, model.dit.layers, plan.out / "start")
+        start = deepen_weights(plan.start, plan.layers, plan.out / "start")
         only = (*model.trained_networks, "vae")
         self.networks = nnx.eval_shape(lambda: Networks.build(model, only=only, rngs=nnx.Rngs(0)))
         for name in only:
             weights.load(start / f"{name}.safetensors", getattr(self.networks, name))
-        vae, self.networks.vae = self.networks.vae, None
+        vae: Any = self.networks.vae
+        self.networks = Networks(
+            dit=self.networks.dit, text=self.networks.text, image=self.networks.image
+        )
         self.vae = nnx.state(vae)
         self.graph, params = nnx.split(self.networks)
         self.denoiser = Updater(weight_decay=plan.weight_decay, ema_decay=plan.ema_decay)
@@ -214,7 +217,7 @@ class OnlineRun:
                     for n, m in zip((self.done, self.decoded), counted, strict=True)
                 ]
                 self._say(
-                    **means(pending),
+                    values=means(pending),
                     step=self.done,
                     rate=rate,
                     clips=self.pool.appended,
@@ -326,10 +329,16 @@ class OnlineRun:
             parts.cut(files, self.plan.out / "weights")
 
     def _say(
-        self, *, step: int = 0, validation: Mapping[str, float] | None = None, **values: Any
+        self,
+        *,
+        step: int = 0,
+        values: Mapping[str, float] | None = None,
+        validation: Mapping[str, float] | None = None,
+        **others: Any,
     ) -> None:
         """Print values, and log those that are numbers."""
-        values |= {f"validation_{name}": value for name, value in (validation or {}).items()}
+        found = {f"validation_{name}": value for name, value in (validation or {}).items()}
+        values = {**(values or {}), **found, **others}
         numbers = {n: float(v) for n, v in values.items() if isinstance(v, int | float)}
         self.log.write(step, {"seconds": self.seconds, **numbers})
         line = "  ".join(
@@ -356,7 +365,5 @@ def _seconds(run: Callable[[float], Any], share: float) -> float:
     """Return the seconds of one of the run's calls: four are made, the first is not counted."""
     jax.block_until_ready(run(share))
     began = time.monotonic()
-    for _ in range(3):
-        metrics = run(share)
-    jax.block_until_ready(metrics)
+    jax.block_until_ready([run(share) for _ in range(3)])
     return (time.monotonic() - began) / 3

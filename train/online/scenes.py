@@ -17,6 +17,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -85,11 +86,13 @@ class EndlessScenes:
 
 def row_of(triplet: Triplet, model: ModelConfig) -> dict[str, np.ndarray]:
     """Return the arrays of a clip that training needs: the condition's inputs and the frames."""
-    packed = {name: array[0] for name, array in pack([triplet], model).items()}
-    return {**packed, "target": triplet.target}
+    row = {name: array[0] for name, array in pack([triplet], model).items()}
+    if triplet.target is not None:
+        row["target"] = triplet.target
+    return row
 
 
-def write_row(folder: Path, name: str, row: Mapping[str, np.ndarray]) -> None:
+def write_row(folder: Path, name: str, row: Mapping[str, Any]) -> None:
     """Write a row to a queue; readers see the complete file or none."""
     hidden = folder / f".{name}.npz"
     with hidden.open("wb") as file:

@@ -67,11 +67,12 @@ class Updater:
     def create(self, params: nnx.State) -> OnlineState:
         """Return the state before the first update."""
         params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), params)
+        average: Any = jax.tree.map(jnp.copy, params)
         return OnlineState(
             step=jnp.int32(0),
             params=params,
             opt_state=self.optimizer.init(params),
-            average=jax.tree.map(jnp.copy, params),
+            average=average,
             skipped=jnp.int32(0),
         )
 
@@ -86,11 +87,12 @@ class Updater:
         params: Any = optax.apply_updates(state.params, jax.tree.map(lambda x: rate * x, updates))
         # At first the average follows faster, so that it does not keep the start.
         decay = jnp.minimum(self.ema_decay, (1 + state.step) / (10 + state.step))
+        average: Any = optax.incremental_update(params, state.average, 1 - decay)
         changed = OnlineState(
             step=state.step + 1,
             params=params,
             opt_state=opt_state,
-            average=optax.incremental_update(params, state.average, 1 - decay),
+            average=average,
             skipped=state.skipped,
         )
         kept = replace(state, step=state.step + 1, skipped=state.skipped + 1)
