@@ -40,7 +40,7 @@ from egosim_jax.io.untrusted.npz import array_names, read_arrays
 from egosim_jax.models.layers import init_sharded
 from egosim_jax.runtime.command import CommandExit, ExitCode, run_with_exit_codes
 from egosim_jax.sharding import batch_sharding, make_mesh
-from egosim_jax.train.config import TrainConfig, learning_rate, numerics_only, resume_mutable
+from egosim_jax.train.config import TrainConfig, numerics_only, resume_mutable
 from egosim_jax.train.metric_writers import JsonLines
 from egosim_jax.train.tasks.denoising import Denoising
 from egosim_jax.train.update import (
@@ -187,7 +187,6 @@ class BundleRun:
         """Update to the last step, or until a time of `time.monotonic`, and save."""
         training, step = self.recipe.training, int(state.step)
         log = JsonLines(self.out / "metrics.jsonl", resume_after=step)
-        rate = learning_rate(training.optimizer, training.steps)
         pending: list[Mapping[str, jax.Array]] = []
         began = time.monotonic()
         while step < training.steps:
@@ -201,8 +200,7 @@ class BundleRun:
             if last or step % training.log_every == 0:
                 means = mean_metrics(pending)
                 seconds = (time.monotonic() - began) / len(pending)
-                values = {**means, "lr": float(np.asarray(rate(step - 1))), "step_time_s": seconds}
-                self._log(log, step, values)
+                self._log(log, step, {**means, "step_time_s": seconds})
                 _check_skips(metrics)
                 pending, began = [], time.monotonic()
             if last or step % training.validate_every == 0:

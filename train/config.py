@@ -169,7 +169,10 @@ def numerics_only(value: Any, path: str) -> Iterator[str]:
 
 
 def learning_rate(config: OptimizerConfig, steps: int) -> optax.Schedule:
-    """Return the learning rate as a function of the number of finished updates."""
+    """Return the learning rate as a function of the number of finished updates.
+
+    Skipped updates count, so that the last update of every run has the last rate.
+    """
     peak, warmup = config.learning_rate, config.warmup_steps
     if config.schedule == "cosine":
         return optax.warmup_cosine_decay_schedule(
@@ -191,12 +194,11 @@ def learning_rate(config: OptimizerConfig, steps: int) -> optax.Schedule:
     return optax.schedules.join_schedules([ramp, after], [warmup])
 
 
-def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformation:
-    """Return the optax transformation of a run of `steps` updates."""
-    rate = learning_rate(config, steps)
+def make_optimizer(config: OptimizerConfig) -> optax.GradientTransformation:
+    """Return the optax transformation at the learning rate 1; the update multiplies by the rate."""
     if config.name == "muon":
         rule = muon(
-            rate,
+            1.0,
             weight_decay=config.weight_decay,
             adam_b1=config.b1,
             adam_b2=config.b2,
@@ -206,7 +208,7 @@ def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransfo
         clip = optax.clip_by_global_norm(config.clip_grad_norm)
         return grouped(optax.chain(clip, rule), _dimensions)
     rule = optax.adamw(
-        rate,
+        1.0,
         config.b1,
         config.b2,
         weight_decay=config.weight_decay,

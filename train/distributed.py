@@ -17,17 +17,17 @@ import itertools
 import os
 import socket
 import sys
-import traceback
+import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import jax
 from jax.experimental import multihost_utils
 
-from egosim_jax.runtime.command import CommandExit, ExitCode
+from egosim_jax.runtime.command import CommandExit, ExitCode, run_with_exit_codes
 from egosim_jax.train.peers import HEARTBEAT_S, PEER_DIED, is_peer_failure, run_in_child
 from egosim_jax.types import InputError
 
@@ -37,13 +37,25 @@ NAMES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 FOREVER_S = 10**8
 """Heartbeat timeout of a run of one process, which may be suspended for long, in seconds."""
 
+JOIN_S = 300
+"""Time for which processes wait at the start for the last one, in seconds."""
+FINISH_S = 3600
+"""Time for which processes wait at the end for the last one, which may write weights, in seconds.
+
+A process that dies meanwhile is noticed as at any other time."""
+LEAVE_S = 10.0
+"""Time for which a failing process waits for the others, which may fail too, in seconds."""
+
 _questions = itertools.count(1)
 """Numbers of the calls of `is_preempted`, the same in all processes."""
 
 
 @contextmanager
 def distributed_context() -> Iterator[None]:
-    """Join the processes of the run before any device is used, and leave them at the end."""
+    """Join the processes of the run before any device is used, and leave them at the end.
+
+    A process that fails alone ends here, so that the others notice it.
+    """
     given = {name: os.environ[name] for name in NAMES if name in os.environ}
     if given:
         if missing := [name for name in NAMES if name not in given]:
@@ -56,36 +68,53 @@ def distributed_context() -> Iterator[None]:
         _initialize(address, int(count), int(index))
     else:
         try:
-            jax.distributed.initialize(heartbeat_timeout_seconds=HEARTBEAT_S)
+            jax.distributed.initialize(
+                initialization_timeout=JOIN_S,
+                heartbeat_timeout_seconds=HEARTBEAT_S,
+                shutdown_timeout_seconds=FINISH_S,
+            )
         except ValueError:  # no cluster
             _initialize(free_local_address(), 1, 0)
     try:
         yield
-    except jax.errors.JaxRuntimeError as error:
-        if jax.process_count() > 1:  # `shutdown` would wait for a dead process, then abort
-            _end_without_others(error)
-        raise
-    finally:
+    except CommandExit:  # all processes stop at the same step
         jax.distributed.shutdown()
+        raise
+    except BaseException as error:
+        _leave(error)
+        raise
+    jax.distributed.shutdown()
 
 
 @contextmanager
 def training_context() -> Iterator[None]:
     """Enter `distributed_context`, in a child process if the run has several processes."""
-    if _is_launched():
+    if _may_have_peers():
         run_in_child()
     with distributed_context():
         yield
 
 
-def _end_without_others(error: Exception) -> NoReturn:
-    """End the process for an error of its devices, and do not wait for the other processes."""
-    code = ExitCode.FAILED
-    if is_peer_failure(error):
-        code = ExitCode.RESUBMIT
+def _leave(error: BaseException) -> None:
+    """Leave the processes of a run because of an error; end this one if the others do not leave.
+
+    If they fail as well, all leave together, each with its own error.
+    """
+
+    def fail() -> int:
+        raise error
+
+    if _may_have_peers() and is_peer_failure(error):
+        # `shutdown` would wait for the dead process, then abort.
         print(PEER_DIED, file=sys.stderr)
+        code = ExitCode.RESUBMIT
     else:
-        traceback.print_exception(error)
+        leaving = threading.Thread(target=jax.distributed.shutdown, daemon=True)
+        leaving.start()
+        leaving.join(LEAVE_S)
+        if not leaving.is_alive():
+            return
+        code = run_with_exit_codes(fail)
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)
@@ -117,10 +146,19 @@ def _is_launched() -> bool:
     return any(name in os.environ for name in NAMES) or any(count != "1" for count in tasks)
 
 
+def _may_have_peers() -> bool:
+    """Return True in a process of a launcher, or on a TPU of several machines in Kubernetes."""
+    return _is_launched() or "," in os.environ.get("TPU_WORKER_HOSTNAMES", "")
+
+
 def _initialize(address: str, count: int, index: int) -> None:
     """Join the service at an address; on the loopback, the service listens on the loopback only."""
     local = _is_loopback(address.rpartition(":")[0])
-    options: dict[str, Any] = {"coordinator_bind_address": address if local else None}
+    options: dict[str, Any] = {
+        "coordinator_bind_address": address if local else None,
+        "initialization_timeout": JOIN_S,
+        "shutdown_timeout_seconds": FINISH_S,
+    }
     if count == 1:
         # One process sends nothing to others. Gloo, the default, would listen all the same.
         jax.config.update("jax_cpu_collectives_implementation", None)

@@ -182,7 +182,6 @@ def encode_shards(
     _open(
         out, {**provenance, "video": config.video, "stride": stride, "shard_windows": shard_windows}
     )
-    _wait_for_all("opened")  # now: a first collective after uneven work may time out
     if (out / MANIFEST).exists():
         shutil.rmtree(out / "parts", ignore_errors=True)
         return read_manifest(out).provenance.get("skipped", [])

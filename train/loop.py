@@ -32,7 +32,7 @@ from egosim_jax.io.weights import hashes, place
 from egosim_jax.models.layers import LowRankParam, init_sharded
 from egosim_jax.runtime.command import CommandExit, ExitCode
 from egosim_jax.sharding import assemble, batch_sharding, make_mesh, parts, process_rows
-from egosim_jax.train.config import TrainConfig, learning_rate, numerics_only, resume_mutable
+from egosim_jax.train.config import TrainConfig, numerics_only, resume_mutable
 from egosim_jax.train.distributed import is_preempted
 from egosim_jax.train.metric_writers import Console, JsonLines, TensorBoard, WandB, Writer
 from egosim_jax.train.monitor import Clock, Samples, SkipMonitor, Watchdog
@@ -123,7 +123,6 @@ class Run:
         self.stack, self.sharding = stack, batch_sharding(jax.sharding.get_mesh())
         self.source, self.frozen, self.update = source, programs.frozen, programs.update
         self.clock, self.skips = Clock(flops=float("nan")), SkipMonitor(source)
-        self.learning_rate = learning_rate(training.optimizer, training.steps)
         self.pending: list[Mapping[str, jax.Array]] = []
         self.writers: list[Writer] = []
         batches = make_batches(source, task, training, self.sharding)
@@ -205,7 +204,6 @@ class Run:
         self.pending = []
         if self.batches.skipped:
             metrics["skipped_records"] = float(len(self.batches.skipped))
-        metrics["lr"] = float(np.asarray(self.learning_rate(step - 1)))
         self.write(step, {**metrics, **self.clock.tick(step, self.training.steps)})
 
     def validate(self, shards: Path, step: int, state: TrainState) -> None:
@@ -278,9 +276,7 @@ class Run:
             create = partial(self.programs.create, loaded)
             return init_sharded(create, out_shardings=sharding)
         # All weights were loaded: donate them, so that no second copy takes memory.
-        create = partial(
-            TrainState.create, config=self.training.optimizer, steps=self.training.steps
-        )
+        create = partial(TrainState.create, config=self.training.optimizer)
         return jax.jit(create, out_shardings=sharding, donate_argnums=0)(loaded)
 
     def _to_devices(self, batch: Mapping[str, np.ndarray]) -> dict[str, jax.Array]:

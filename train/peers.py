@@ -17,6 +17,7 @@ import sys
 from typing import Any, cast
 
 from egosim_jax.runtime.command import ExitCode
+from egosim_jax.types import InputError
 
 CHILD = "EGOSIM_TRAIN_CHILD"
 """Environment variable that the waiting process sets for its child."""
@@ -29,7 +30,11 @@ _REPORT = re.compile(
     rb"^[WEF]\d{4} [^\n]*(?:coordination_service|preemption_sync|client\.h)", re.MULTILINE
 )
 _FATAL = b"JAX distributed service detected fatal errors"
-_LOST = re.compile(r"gloo|nccl|connection (?:reset|closed|refused)|socket closed", re.IGNORECASE)
+_LOST = re.compile(
+    r"gloo|nccl|connection (?:reset|closed|refused)|socket closed|coordination service"
+    r"|heartbeat timeout|barrier (?:failed|timed out)",
+    re.IGNORECASE,
+)
 _PR_SET_PDEATHSIG = 1
 
 
@@ -67,7 +72,9 @@ def _copy_stderr(child: subprocess.Popen[bytes]) -> bytes:
     pipe, ended, held = cast(Any, child.stderr).fileno(), os.pidfd_open(child.pid), b""
     watched = [pipe, ended]
     while True:
-        ready = select.select(watched, [], [], HOLD_S if held else None)[0]
+        # After the fatal line the child ends; on a busy machine it may take long for its stack.
+        limit = HOLD_S if held and _FATAL not in held else None
+        ready = select.select(watched, [], [], limit)[0]
         data = os.read(pipe, 1 << 16) if pipe in ready else b""
         if pipe in ready and not data:
             watched.remove(pipe)  # closed by the child, which may still run
@@ -80,5 +87,11 @@ def _copy_stderr(child: subprocess.Popen[bytes]) -> bytes:
 
 
 def is_peer_failure(error: BaseException) -> bool:
-    """Return True for an error of a collective that lost its connection to another process."""
-    return bool(_LOST.search(str(error)))
+    """Return True if an error or its cause is of a lost connection to another process."""
+    cause: BaseException | None = error
+    while cause is not None:
+        # Ours may quote a path, a system error a server. jax's may also be a ValueError.
+        if not isinstance(cause, InputError | OSError) and _LOST.search(str(cause)):
+            return True
+        cause = cause.__cause__ or cause.__context__
+    return False

@@ -23,7 +23,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Key
 
 from egosim_jax.sharding import batch_sharding, check_batch, constrain, state_sharding
-from egosim_jax.train.config import OptimizerConfig, TrainConfig, make_optimizer
+from egosim_jax.train.config import OptimizerConfig, TrainConfig, learning_rate, make_optimizer
 
 Batch = Mapping[str, jax.Array]
 Metrics = dict[str, jax.Array]
@@ -110,12 +110,12 @@ class TrainState:
     """Exponential moving average of `params`; None without `ema_decay`."""
 
     @classmethod
-    def create(cls, params: nnx.State, config: OptimizerConfig, steps: int) -> TrainState:
-        """Return the state before the first update of a run of `steps` updates."""
+    def create(cls, params: nnx.State, config: OptimizerConfig) -> TrainState:
+        """Return the state before the first update."""
         return cls(
             step=jnp.int32(0),
             params=params,
-            opt_state=make_optimizer(config, steps).init(params),
+            opt_state=make_optimizer(config).init(params),
             grad_norm_ema=jnp.float32(0),
             consecutive_skips=jnp.int32(0),
             ema_params=None if config.ema_decay is None else jax.tree.map(jnp.copy, params),
@@ -125,11 +125,13 @@ class TrainState:
         self,
         gradients: nnx.State,
         norm: jax.Array,
+        rate: jax.Array,
         training: TrainConfig,
-        optimizer: optax.GradientTransformation,
     ) -> TrainState:
-        """Return the state after an update with gradients of global norm `norm`."""
+        """Return the state after an update with gradients of global norm `norm`, at a rate."""
+        optimizer = make_optimizer(training.optimizer)
         updates, opt_state = optimizer.update(gradients, self.opt_state, self.params)
+        updates = jax.tree.map(lambda update: rate * update, updates)
         params: Any = optax.apply_updates(self.params, updates)
         ema_params: Any = self.ema_params
         if ema_params is not None:
@@ -165,7 +167,7 @@ def make_update(
     Its randomness depends only on seed and step. `grad_accum_steps` parts of the batch are
     processed one after the other and give the same gradient.
     """
-    config, optimizer = training.optimizer, make_optimizer(training.optimizer, training.steps)
+    config, schedule = training.optimizer, learning_rate(training.optimizer, training.steps)
 
     def update(state: TrainState, frozen: nnx.State, batch: Batch) -> tuple[TrainState, Metrics]:
         def loss(params: nnx.State, batch: Batch, keys: jax.Array) -> tuple[jax.Array, Metrics]:
@@ -184,13 +186,15 @@ def make_update(
         if config.skip_grad_norm_factor is not None:
             limit = config.skip_grad_norm_factor * state.grad_norm_ema
             valid &= (state.step < GUARD_WARMUP) | (norm <= limit)
-        changed = state.apply_gradients(gradients, norm, training, optimizer)
+        # The optimizer's own count would lag behind: it does not count skipped updates.
+        rate = jnp.asarray(schedule(state.step), jnp.float32)
+        changed = state.apply_gradients(gradients, norm, rate, training)
         # `where` drops the NaNs of a bad update: the optimizer state stays finite, too.
         state = jax.tree.map(
             lambda new, old: jnp.where(valid, new, old), changed, state.skip_update()
         )
-        skips = state.consecutive_skips
-        return state, {"loss": value, "grad_norm": norm, "consecutive_skips": skips, **metrics}
+        own = {"loss": value, "grad_norm": norm, "lr": rate}
+        return state, {**own, "consecutive_skips": state.consecutive_skips, **metrics}
 
     return update
 
@@ -222,16 +226,17 @@ def accumulate_gradients(gradient: Callable[..., Any], parts: int) -> Callable[.
 
 
 def mean_metrics(rows: Sequence[Mapping[str, jax.Array]]) -> dict[str, float]:
-    """Fetch the metrics of updates from the devices and return their means.
+    """Fetch the metrics of updates from the devices; return their means, and the last rate.
 
     Skipped updates are counted as `skipped_updates` and excluded from the means.
     """
     fetched = jax.device_get(rows)
     kept = [row for row in fetched if not row["consecutive_skips"]]
-    names = [name for name in fetched[0] if name != "consecutive_skips"]
+    names = [name for name in fetched[0] if name not in ("consecutive_skips", "lr")]
     metrics = {name: float(np.mean([row[name] for row in kept])) for name in names if kept}
-    skipped = len(fetched) - len(kept)
-    return {**metrics, "skipped_updates": float(skipped)} if skipped else metrics
+    if skipped := len(fetched) - len(kept):
+        metrics["skipped_updates"] = float(skipped)
+    return {**metrics, "lr": float(fetched[-1]["lr"])}
 
 
 def make_validation(
@@ -301,7 +306,7 @@ class Programs:
             params = nnx.state(task.networks(nnx.Rngs(training.seed)), task.trained)
             if loaded is not None:
                 params = nnx.merge_state(params, loaded)
-            return TrainState.create(params, training.optimizer, training.steps)
+            return TrainState.create(params, training.optimizer)
 
         state, placed = jax.eval_shape(create), batch_sharding(mesh)
         sharding, frozen_sharding = state_sharding(mesh, state), state_sharding(mesh, frozen)

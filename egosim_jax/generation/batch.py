@@ -67,6 +67,11 @@ SHEET_ROWS = ("prior", "hands", "generated", "ground truth")
 """Rows of each clip on the contact sheet; the last one only if it is known."""
 SHEET_WIDTH = 240
 """Width of a frame on the contact sheet in pixels."""
+NO_TRUTH = (
+    "without ground truth nothing can be reconstructed: add its video (column video), or omit "
+    "--reconstruct."
+)
+"""Problem of a clip without ground truth."""
 
 Failure = tuple[Window, str]
 """A window and why it failed."""
@@ -227,10 +232,7 @@ class BatchJob:
             )
             target = window.files.target
             if self.reconstruct and (target is None or not target.exists()):
-                problems.append(
-                    "without ground truth nothing can be reconstructed: add its video (column "
-                    "video), or omit --reconstruct."
-                )
+                problems.append(NO_TRUTH)
             if problems:
                 rejected.append((window, listing(problems)))
             else:
@@ -305,8 +307,10 @@ class BatchJob:
                     grid=self.model.grid,
                 )
                 self.model.layout.check_mask(triplet.mask)
+                if self.reconstruct and triplet.target is None:  # it was there at the check
+                    raise InputError(NO_TRUTH)
                 loaded.append((window, triplet, digest))
-            except InputError as error:
+            except (InputError, OSError) as error:  # such as a stale handle of a file server
                 failed.append((window, str(error)))
                 self._report(window, status="failed", error=str(error))
         return loaded, failed

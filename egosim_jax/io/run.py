@@ -13,6 +13,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from egosim_jax.io.atomic import atomic_write, hold_folder
 from egosim_jax.io.bounded import MAX_QUOTED, listing, quote, quote_text, read_json
 from egosim_jax.types import InputError
@@ -20,6 +22,8 @@ from egosim_jax.types import InputError
 CONFIG, ENVIRONMENT = "config.json", "environment.json"
 OUTPUT = "out"
 """Name of config fields with an output folder, which are not compared."""
+MAX_REFUSAL_BYTES = 4096
+"""Length of the message that the first process of a run sends to the others."""
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "grain", "numpy", "av")
 
 
@@ -93,25 +97,58 @@ def open_folder(folder: Path, config: Any, *, mutable: Collection[str] = ()) -> 
 
     The folder is locked until the process ends. Fields named `out` are not compared, so that a
     folder can be moved. Fields whose dotted paths are in `mutable`, or below, are not compared
-    either. Of several processes, the first locks and writes. Raises `InputError` when the folder
-    cannot be written, is in use, lost its config, or holds a run of another config, naming the
-    fields that differ.
+    either. All processes of a run call this: the first locks, compares and writes, then the others
+    compare; what the first one refuses, all refuse. Raises `InputError` when the folder cannot be
+    written, is in use, lost its config, or holds a run of another config, naming the fields that
+    differ.
     """
     import jax
 
-    path, wanted = folder / CONFIG, plain(config)
+    refusal = ""
+    if jax.process_index() == 0:
+        try:
+            _begin(folder, config, mutable)
+        except InputError as error:
+            refusal = str(error)
+    if jax.process_count() > 1:
+        refusal = _of_the_first_process(refusal)
+    if refusal:
+        raise InputError(refusal)
+    if jax.process_index() != 0:
+        _compare(folder, config, mutable)
+
+
+def _of_the_first_process(text: str) -> str:
+    """Return the text of the first process in all processes, for which each waits."""
+    from jax.experimental import multihost_utils
+
+    data = text.encode()[:MAX_REFUSAL_BYTES].ljust(MAX_REFUSAL_BYTES, b"\0")
+    shared = multihost_utils.broadcast_one_to_all(np.frombuffer(data, np.uint8))
+    return np.asarray(shared, np.uint8).tobytes().rstrip(b"\0").decode("utf-8", "ignore")
+
+
+def _begin(folder: Path, config: Any, mutable: Collection[str]) -> None:
+    """Lock a folder, compare its config and write this run's."""
     try:
-        if jax.process_index() == 0:
-            hold_folder(folder)
-        recorded = read_json(path) if path.exists() else None
+        hold_folder(folder)
+        is_known = (folder / CONFIG).exists()
     except OSError as error:
         raise InputError(f"Cannot write to {folder}: {error.strerror}. (--out)") from error
-    if recorded is None and (folder / ENVIRONMENT).exists():
+    if not is_known and (folder / ENVIRONMENT).exists():
         raise InputError(
-            f"{path} is missing, although {folder} holds a run: its config is unknown. Restore the "
-            "file, or choose another --out."
+            f"{folder / CONFIG} is missing, although {folder} holds a run: its config is unknown. "
+            "Restore the file, or choose another --out."
         )
-    if recorded is not None:
+    _compare(folder, config, mutable)
+    write_json(folder / CONFIG, config)
+    write_json(folder / ENVIRONMENT, environment())
+
+
+def _compare(folder: Path, config: Any, mutable: Collection[str]) -> None:
+    """Raise `InputError` if a folder has another config."""
+    path, wanted = folder / CONFIG, plain(config)
+    if path.exists():
+        recorded = read_json(path)
         if not isinstance(recorded, dict):
             raise InputError(f"{path} is not a config. Restore it. (--out)")
         differing = [
@@ -124,9 +161,6 @@ def open_folder(folder: Path, config: Any, *, mutable: Collection[str] = ()) -> 
                 f"{folder} holds a run of another config. Choose another --out, or the same "
                 f"config: {listing(differing)}."
             )
-    if jax.process_index() == 0:
-        write_json(path, config)
-        write_json(folder / ENVIRONMENT, environment())
 
 
 def _differences(recorded: Any, wanted: Any, path: str = "") -> dict[str, str]:

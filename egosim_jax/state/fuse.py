@@ -6,8 +6,8 @@
 3. Free space is carved: a point of the state is removed if the last frames that could have observed
    it see through it. (The original does not carve: moved objects leave ghost points.)
 4. New points replace points of the state within 5 mm, and take the color of the nearest one of the
-   same object. Generated colors drift from clip to clip, so an observed surface is not repainted.
-   (The original repaints.)
+   same object, even if it is carved. Generated colors drift from clip to clip, so an observed
+   surface is not repainted. (The original repaints.)
 
 The update is idempotent, and clips of different places commute. The points have a canonical order,
 so equal states are equal arrays.
@@ -59,8 +59,10 @@ def fuse(state: SceneState, perceived: Perceived, *, fusion: Fusion | None = Non
     valid = valid_depth_mask(perceived.depth_m)
     new = reconstruct(perceived, valid, disappeared, fusion or Fusion())
     old = apply_motion(state, perceived, disappeared)
-    old = carve_free_space(old, perceived, valid)
+    # Before carving, which on a second update may remove new points of the first one: they would
+    # then take the color of a neighbor.
     new = replace(new, colors=transfer_colors(new, old))
+    old = carve_free_space(old, perceived, valid)
     old = old[~_has_neighbor(old.points_m, new.points_m, REPLACE_M)]
     points = canonical_sort(concat([old, new]))
     poses = {n: path[-1] for n, path in perceived.world_from_object.items()}

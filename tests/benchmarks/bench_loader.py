@@ -184,7 +184,7 @@ def report_waiting(config: ModelConfig, source: ShardReader, steps: int) -> None
     graph, params, frozen = nnx.split(task.networks(nnx.Rngs(0)), task.trained, ...)
     training = TrainConfig(steps=steps, optimizer=OptimizerConfig(name="muon"))
     update = jax.jit(make_update(task, graph, training), donate_argnums=0)
-    state = TrainState.create(params, training.optimizer, steps)
+    state = TrainState.create(params, training.optimizer)
     with closing(make_loader(source, batch_size=BATCH, seed=0)) as batches:
         state, before = update(state, frozen, jax.device_put(next(batches)))
         jax.block_until_ready(state)

@@ -155,7 +155,7 @@ def our_step(config: ModelConfig, batch: Batch, theirs: Theirs) -> Step:
     optimizer = OptimizerConfig(name="muon", learning_rate=LEARNING_RATE)
     training = TrainConfig(steps=1, optimizer=optimizer)
     update = jax.jit(make_update(task, graph, training), donate_argnums=0)
-    state = TrainState.create(params, optimizer, steps=1)
+    state = TrainState.create(params, optimizer)
     placed = {name: jnp.asarray(array) for name, array in batch.items()}
 
     def step() -> tuple[float, float]:

@@ -77,7 +77,7 @@ def main(data: int, fsdp: int, context: int, parts: int, out: str, task: str = "
         noisy = [
             x + 0.05 * jax.random.normal(k, x.shape) for x, k in zip(leaves, keys, strict=True)
         ]
-        return TrainState.create(jax.tree.unflatten(tree, noisy), config, STEPS)
+        return TrainState.create(jax.tree.unflatten(tree, noisy), config)
 
     graph = nnx.graphdef(nnx.eval_shape(lambda: chosen.networks(nnx.Rngs(0))))
     sharding = state_sharding(mesh, jax.eval_shape(create))

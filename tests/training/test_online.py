@@ -117,7 +117,7 @@ def test_grouped_muon_equals_muon_of_each_weight():
     params = nnx.state((networks.dit, networks.text, networks.image), nnx.Param)
     draw = np.random.default_rng(0)
     gradients = jax.tree.map(lambda x: jnp.asarray(draw.normal(size=x.shape), jnp.float32), params)
-    config = OptimizerConfig(name="muon", learning_rate=1e-2, weight_decay=0.05)
+    config = OptimizerConfig(name="muon", weight_decay=0.05)
 
     def axes(leaf):
         """Return the axes of a matrix `[layers?, ..., in, out]`; embeddings are not matrices."""
@@ -136,7 +136,7 @@ def test_grouped_muon_equals_muon_of_each_weight():
     single = optax.chain(
         optax.clip_by_global_norm(1.0),
         muon(
-            1e-2,
+            1.0,
             weight_decay=0.05,
             consistent_rms=0.2,
             muon_weight_dimension_numbers=lambda tree: jax.tree.map(
@@ -145,12 +145,12 @@ def test_grouped_muon_equals_muon_of_each_weight():
         ),
     )
     updates = []
-    for optimizer in (single, make_optimizer(config, 10)):
+    for optimizer in (single, make_optimizer(config)):
         found, state = optimizer.update(gradients, optimizer.init(params), params)
         found, _ = optimizer.update(gradients, state, params)
         updates.append(jax.tree.leaves(found))
     for one, other in zip(*updates, strict=True):
-        np.testing.assert_allclose(other, one, atol=1e-6)
+        np.testing.assert_allclose(other, one, atol=1e-4)
 
 
 def test_half_of_the_times_are_those_of_the_sampler():

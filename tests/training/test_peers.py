@@ -12,6 +12,7 @@ import pytest
 
 from egosim_jax.train.distributed import free_local_address
 from egosim_jax.train.peers import PEER_DIED, is_peer_failure
+from egosim_jax.types import InputError
 from tests.flags import QUICK
 from tests.training.line import write_points
 
@@ -31,13 +32,18 @@ def start(code: str, **options) -> subprocess.Popen:
     ("code", "ends", "says"),
     [
         (f"sys.stderr.write({REPORT!r}); sys.stderr.flush(); os.abort()", 75, f"{PEER_DIED}\n"),
+        (
+            f"sys.stderr.write({REPORT!r}); sys.stderr.flush(); time.sleep(7); os.abort()",
+            75,
+            f"{PEER_DIED}\n",
+        ),
         (f"sys.stderr.write({REPORT!r}); sys.exit(1)", 1, REPORT),
         ("sys.stderr.write('a defect'); sys.stderr.flush(); os.abort()", -6, "a defect"),
         ("sys.stderr.write('as usual'); sys.exit(3)", 3, "as usual"),
         ("os.kill(os.getpid(), 9)", -9, ""),
         ("os.close(2); time.sleep(0.2); os._exit(70)", 70, ""),
     ],
-    ids=["report", "report and exit", "abort", "exit", "killed", "closed stderr"],
+    ids=["report", "slow report", "report and exit", "abort", "exit", "killed", "closed stderr"],
 )
 def test_a_child_is_replaced_only_by_the_report_of_jax(code, ends, says):
     process = start(f"run_in_child()\n{code}", stderr=subprocess.PIPE)
@@ -62,7 +68,13 @@ def test_sigterm_reaches_the_child_and_sigkill_ends_it():
 def test_errors_of_lost_connections_differ_from_others():
     for text in ("Gloo all-reduce failed: Connection closed by peer", "NCCL error: unhandled"):
         assert is_peer_failure(RuntimeError(text))
+        assert is_peer_failure(ValueError(f"UNKNOWN: {text}"))  # by `multihost_utils`
     assert not is_peer_failure(RuntimeError("RESOURCE_EXHAUSTED: out of memory"))
+    wrapped = InputError("the checkpoint cannot be read")
+    wrapped.__cause__ = RuntimeError("UNAVAILABLE: the coordination service is gone")
+    assert is_peer_failure(wrapped)
+    assert not is_peer_failure(InputError("gloo/nccl.mp4 is missing"))
+    assert not is_peer_failure(RuntimeError("RESOURCE_EXHAUSTED: optimization-barrier.3"))
 
 
 @pytest.mark.slow

@@ -25,9 +25,6 @@ from egosim_jax.train.tasks.denoising import Denoising, condition_of
 from egosim_jax.train.tasks.refining import Refining, lpips
 from egosim_jax.train.update import Metrics
 
-UNIT = OptimizerConfig(name="muon", learning_rate=1.0)
-"""Optimizer whose updates are scaled by the schedule's rate."""
-
 
 @no_type_check
 @jax.tree_util.register_dataclass
@@ -62,7 +59,7 @@ class Updater:
     @property
     def optimizer(self) -> optax.GradientTransformation:
         """Muon at rate 1."""
-        return make_optimizer(replace(UNIT, weight_decay=self.weight_decay), 1)
+        return make_optimizer(OptimizerConfig(name="muon", weight_decay=self.weight_decay))
 
     def create(self, params: nnx.State) -> OnlineState:
         """Return the state before the first update."""

@@ -10,7 +10,7 @@ import pytest
 from egosim_jax import configs
 from egosim_jax.cli.generate import Generate
 from egosim_jax.conditioning.condition import Condition
-from egosim_jax.diffusion import Euler, Guidance, RectifiedFlow
+from egosim_jax.diffusion import DDIM, Euler, Guidance, RectifiedFlow, VariancePreserving
 from egosim_jax.generation.batch import STRENGTH, BatchJob
 from egosim_jax.generation.generator import Generator, denoise
 from egosim_jax.types import InputError, Triplet
@@ -108,18 +108,28 @@ def test_sdedit_takes_the_last_steps_from_the_noised_prior():
     assert dit.condition[..., at["hands"].start - shift :].any()
 
 
-@pytest.mark.parametrize("rounding", ["none", "bfloat16", "down"])
-@pytest.mark.parametrize("steps", [4, 100, 200, 1000])
-@pytest.mark.parametrize("strength", [0.75, 0.31, 1.0])
-def test_sdedit_visits_the_last_times_of_the_sampler(rounding, steps, strength):
+PROCESSES = {
+    "exact": RectifiedFlow(),
+    "bfloat16": RectifiedFlow(timestep_rounding="bfloat16"),
+    "down": RectifiedFlow.wan_unipc(5.0),
+    "epsilon": RectifiedFlow(prediction="epsilon", sigma_max=0.999),
+    "trailing": VariancePreserving(),
+    "leading": VariancePreserving(spacing="leading"),
+}
+
+
+@pytest.mark.parametrize("process", PROCESSES.values(), ids=PROCESSES)
+@pytest.mark.parametrize("steps", [1, 4, 100, 200, 333, 1000])
+@pytest.mark.parametrize("strength", [0.01, 0.31, 0.75, 1.0])
+def test_sdedit_visits_the_last_times_of_the_sampler(process, steps, strength):
     """Also if their rounded timesteps repeat."""
-    process = RectifiedFlow(shift=5.0, timestep_rounding=rounding)
+    solver = Euler() if isinstance(process, RectifiedFlow) else DDIM()
     config = replace(
-        configs.get("debug"), process=process, steps=steps, strength=strength, solver=Euler()
+        configs.get("debug"), process=process, steps=steps, strength=strength, solver=solver
     )
     times = process.times(steps)
     visited = process.times(config.visited)
-    assert len(visited) == int(strength * steps) + 1
+    assert len(visited) == max(1, int(strength * steps)) + 1
     np.testing.assert_allclose(visited, times[-len(visited) :], rtol=1e-14)
 
 

@@ -72,6 +72,24 @@ def test_a_reconstruction_without_ground_truth_is_refused_before_work(tmp_path, 
     assert not job(tmp_path / "other", policy="lenient").check(found)[1]
 
 
+@pytest.mark.parametrize("name", ["target", "hands"])
+def test_a_file_that_disappears_after_the_check_costs_one_clip(tmp_path, name):
+    out, found = tmp_path / "out", windows(tmp_path / "clips", a=40, b=120)
+    given = job(out, reconstruct=True, policy="lenient", batch_size=2)
+
+    def load(mesh):
+        getattr(found[0].files, name).unlink()
+        return given.load(mesh)
+
+    given.open()
+    outcome = given.generate(found, load=load)
+    assert (outcome.done, outcome.failed) == (1, 1)
+    results = read_results(out)
+    assert results["b"]["status"] == "done"
+    assert ("ground truth" if name == "target" else "No such file") in results["a"]["error"]
+    assert (out / "b_vae.mp4").exists()
+
+
 def test_one_clip_that_is_not_finite_does_not_cost_the_others_of_its_batch(tmp_path, monkeypatch):
     made = Generator.generate
 

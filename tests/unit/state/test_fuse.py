@@ -121,6 +121,21 @@ def test_fusing_the_same_again_changes_nothing():
     assert fingerprint(twice) == fingerprint(once)
 
 
+def test_no_update_changes_a_color_when_it_is_repeated():
+    """Noisy depth, so that frames see through points of the same clip, and drifting colors."""
+    rng = np.random.default_rng(0)
+    state = start()
+    for step in range(1, 5):
+        clip = tracked(step) if step == 1 else perceived([THERE] * FRAMES, step=step)
+        noise = rng.normal(0, 0.012, clip.depth_m.shape).astype(np.float32)
+        colors = rng.integers(0, 255, clip.frames.shape).astype(np.uint8)
+        clip = replace(clip, depth_m=clip.depth_m + noise, frames=colors)
+        state = fuse(state, clip, fusion=COARSE)
+        again = fuse(state, clip, fusion=COARSE)
+        np.testing.assert_array_equal(again.points_m, state.points_m)
+        np.testing.assert_array_equal(again.colors, state.colors, err_msg=f"update {step}")
+
+
 def test_what_was_seen_keeps_its_colors_and_what_is_new_has_those_of_the_clip():
     clip = tracked()
     drifted = replace(clip, frames=255 - clip.frames)

@@ -1,0 +1,150 @@
+"""One process of four dies at a random time: the others end, and the run resumes bit for bit.
+
+    KILLS=10 pytest -m slow -s tests/training/test_deaths.py
+
+kills ten times and prints how long the others took to end.
+"""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from egosim_jax.io.atomic import lock_folder
+from egosim_jax.runtime.command import ExitCode
+from egosim_jax.train.distributed import free_local_address
+from egosim_jax.train.peers import PEER_DIED
+from tests import flags
+from tests.training.killing import ROOT, Run, logged
+from tests.training.line import write_points
+
+pytestmark = pytest.mark.slow
+KILLS, PROCESSES, BOUND_S = int(os.environ.get("KILLS", "2")), 4, 60
+STEPS = 40 * (KILLS + 1)
+
+
+class LineRun(Run):
+    """A run of `tests.training.line` in several processes."""
+
+    def __init__(self, data: Path, out: Path):
+        super().__init__(data, out, steps=STEPS, save_every=5, processes=PROCESSES)
+        program = [sys.executable, "-m", "tests.training.line", str(out), str(data)]
+        settings = f'{{"steps": {STEPS}, "save_every": 5, "pause": 0.01}}'
+        self.command = [*program, settings]
+
+    def wait(self, processes: list[subprocess.Popen], ready: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + 600
+        while not ready():
+            assert all(process.poll() is None for process in processes), self.output()
+            assert time.monotonic() < deadline, self.output()
+            time.sleep(0.002)
+
+
+def child_of(process: subprocess.Popen) -> int:
+    """Return the process that trains, whose parent only waits."""
+    tasks = Path(f"/proc/{process.pid}/task").glob("*/children")
+    (child,) = {int(pid) for path in tasks for pid in path.read_text().split()}
+    return child
+
+
+def test_a_run_survives_random_deaths(tmp_path):
+    rng = random.Random(0)
+    data = write_points(tmp_path / "data")
+    whole, killed = (LineRun(data, tmp_path / name) for name in ("whole", "killed"))
+    whole.finish()
+    for number in range(KILLS):
+        processes = killed.start()
+        phase = ("updates", "save", "start")[number % 3]
+        environment = killed.out / "environment.json"
+        before = environment.stat().st_mtime_ns if environment.exists() else 0
+        lines = len(killed.lines())
+        more = rng.randint(3, 12)
+        killed.wait(
+            processes,
+            lambda: environment.exists() and environment.stat().st_mtime_ns > before,  # noqa: B023
+        )
+        if phase == "start":
+            time.sleep(rng.uniform(0, 2))
+        else:
+            killed.wait(processes, lambda: len(killed.lines()) > lines + more)  # noqa: B023
+        if phase == "save":
+            killed.wait(processes, killed.is_saving)
+        victim = rng.randrange(PROCESSES)
+        whom = rng.choice(["process", "child"])
+        pid = child_of(processes[victim]) if whom == "child" else processes[victim].pid
+        os.kill(pid, signal.SIGKILL)
+        began = time.monotonic()
+        others = [process for n, process in enumerate(processes) if n != victim]
+        codes = [process.wait(timeout=BOUND_S) for process in others]
+        seconds = time.monotonic() - began
+        processes[victim].wait(timeout=BOUND_S)
+        print(f"kill {number + 1} in {phase}: {whom} {victim}, others after {seconds:.1f} s")
+        assert codes == [ExitCode.RESUBMIT] * len(others), killed.output()
+        text = (tmp_path / f"killed_{(victim + 1) % PROCESSES}.log").read_text()
+        assert text.rstrip().endswith(PEER_DIED)
+        assert "Check failure stack trace" not in text
+    killed.finish()
+    assert logged(killed.out) == logged(whole.out)
+
+
+def run_two(
+    out: Path, data: list[Path], settings: list[dict[str, object]]
+) -> tuple[list[int], list[str]]:
+    """Run two processes with their own data and settings; return their exit codes and stderr."""
+    address, processes = free_local_address(), []
+    for index in range(2):
+        command = [sys.executable, "-m", "tests.training.line", str(out), str(data[index])]
+        shared = {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": "2"}
+        processes.append(
+            subprocess.Popen(
+                [*command, json.dumps(settings[index])],
+                cwd=ROOT,
+                env=os.environ | flags.devices(1) | shared | {"JAX_PROCESS_ID": str(index)},
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+        )
+    said = [process.communicate(timeout=300)[1] for process in processes]
+    return [process.returncode for process in processes], said
+
+
+@pytest.mark.parametrize("failing", [0, 1])
+def test_the_error_of_one_process_ends_the_other(tmp_path, failing):
+    data = write_points(tmp_path / "data")
+    read = [data, data]
+    read[failing] = tmp_path / "missing"
+    codes, said = run_two(tmp_path / "run", read, [{}, {}])
+    assert codes[failing] == ExitCode.USAGE
+    assert "missing" in said[failing]
+    assert codes[1 - failing] == ExitCode.RESUBMIT
+    assert said[1 - failing].rstrip().endswith(PEER_DIED)
+    assert "Traceback" not in "".join(said)
+
+
+def test_an_error_of_all_processes_is_printed_by_each(tmp_path):
+    missing = tmp_path / "missing"
+    codes, said = run_two(tmp_path / "run", [missing, missing], [{}, {}])
+    assert codes == [ExitCode.USAGE, ExitCode.USAGE]
+    assert all("missing" in text and PEER_DIED not in text for text in said)
+
+
+def test_processes_with_different_options_are_refused(tmp_path):
+    data = write_points(tmp_path / "data")
+    codes, said = run_two(tmp_path / "run", [data, data], [{"seed": 1}, {"seed": 2}])
+    assert codes == [ExitCode.RESUBMIT, ExitCode.USAGE]
+    assert "training.seed: the folder has 1, this run has 2" in said[1]
+
+
+def test_all_processes_refuse_a_folder_that_another_run_uses(tmp_path):
+    data = write_points(tmp_path / "data")
+    with lock_folder(tmp_path / "run"):
+        codes, said = run_two(tmp_path / "run", [data, data], [{}, {}])
+    assert codes == [ExitCode.USAGE, ExitCode.USAGE]
+    assert all(f"in use by another process (PID {os.getpid()})" in text for text in said)
