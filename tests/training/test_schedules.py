@@ -49,10 +49,12 @@ def test_the_rate_in_the_log_is_the_rate_that_was_used(schedule, end):
             bad = (step % 2 == 1 and step != STEPS - 1) or step == 0
             state, metrics = programs.update(state, programs.frozen, batch(bad=bad))
             rate = mean_metrics([metrics])["lr"]
-            assert rate == pytest.approx(float(learning_rate(optimizer, STEPS)(step)), abs=1e-8)
+            assert rate == pytest.approx(
+                float(jnp.asarray(learning_rate(optimizer, STEPS)(step))), abs=1e-8
+            )
             used = before - np.asarray(state.params["bias"][...])
             np.testing.assert_allclose(used, 0 if bad else rate, rtol=1e-4, atol=1e-7)
-    assert float(learning_rate(optimizer, STEPS)(STEPS)) == pytest.approx(end)
+    assert float(jnp.asarray(learning_rate(optimizer, STEPS)(STEPS))) == pytest.approx(end)
     assert int(state.step) == STEPS
 
 
@@ -66,7 +68,9 @@ def test_a_run_with_skips_logs_the_rate_of_each_step_and_resumes_bit_for_bit(tmp
 
     log, kernel = run()
     assert sum("skipped_updates" in line for line in log) == 2
-    rates = [float(learning_rate(config.optimizer, STEPS)(step)) for step in range(STEPS)]
+    rates = [
+        float(jnp.asarray(learning_rate(config.optimizer, STEPS)(step))) for step in range(STEPS)
+    ]
     assert [line["lr"] for line in log] == pytest.approx(rates)
     for step in (9, 10):
         shutil.rmtree(tmp_path / "run/checkpoints" / str(step))
