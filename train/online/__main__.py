@@ -48,7 +48,7 @@ def main(args: Sequence[str] | None = None) -> int:
             dit = replace(dit, dtype="bfloat16", products=None, attention="cudnn")
         start = options.pop("weights") or configs.shipped_weights(model.name)
         if start is None:
-            raise InputError(f"{model.name} has no weights of its own: give some. (--weights)")
+            raise InputError(f"{model.name} has no weights in the package: give some. (--weights)")
         plan = OnlineTraining(model=replace(model, dit=dit), start=start, **options)
         OnlineRun(plan).train()
         return ExitCode.DONE

@@ -115,7 +115,7 @@ def main(args: Sequence[str] | None = None) -> None:
     options = parser.parse_args(args)
     weights = options.weights or configs.shipped_weights(options.config)
     if weights is None:
-        parser.error(f"{options.config} has no weights of its own: give some with --weights")
+        parser.error(f"{options.config} has no weights in the package: give some with --weights")
     began = time.monotonic()
     for made in make_latents(
         configs.get(options.config),
