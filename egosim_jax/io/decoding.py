@@ -32,6 +32,7 @@ from typing import Literal, cast
 
 import av
 import numpy as np
+from av import error as ffmpeg_errors
 from av.container import InputContainer
 from av.packet import Packet
 from av.stream import Disposition
@@ -92,11 +93,11 @@ _ONE_VIEW, _RECTILINEAR = (0, 8), 4
 _FORMATS = "MP4, MOV, Matroska, WebM, AVI or MPEG-TS"
 _CONVERT = "onvert it, for instance with `ffmpeg -i IN -pix_fmt yuv444p OUT.mp4`."
 _REASONS = {
-    av.error.ArgumentError: "it is of another format",
-    av.error.DecoderNotFoundError: "its codec is not known",
-    av.error.EOFError: "it ends too early",
-    av.error.InvalidDataError: "its data are not valid",
-    av.error.PatchWelcomeError: "it uses a part of its format that is not known",
+    ffmpeg_errors.ArgumentError: "it is of another format",
+    ffmpeg_errors.DecoderNotFoundError: "its codec is not known",
+    ffmpeg_errors.EOFError: "it ends too early",
+    ffmpeg_errors.InvalidDataError: "its data are not valid",
+    ffmpeg_errors.PatchWelcomeError: "it uses a part of its format that is not known",
 }
 """FFmpeg's errors in plain words; others have its own words."""
 _OPTIONS = {
