@@ -32,12 +32,12 @@ from typing import Literal, cast
 
 import av
 import numpy as np
-from av import error as errors
+from av import error as ffmpeg_errors
 from av.container import InputContainer
 from av.packet import Packet
 from av.stream import Disposition
 from av.video.frame import VideoFrame
-from av.video.reformatter import ColorPrimaries, Interpolation, VideoReformatter
+from av.video.reformatter import ColorPrimaries, Interpolation
 from av.video.stream import VideoStream
 
 from egosim_jax.io.bounded import open_regular, quote_path, quote_text
@@ -93,11 +93,11 @@ _ONE_VIEW, _RECTILINEAR = (0, 8), 4
 _FORMATS = "MP4, MOV, Matroska, WebM, AVI or MPEG-TS"
 _CONVERT = "onvert it, for instance with `ffmpeg -i IN -pix_fmt yuv444p OUT.mp4`."
 _REASONS = {
-    errors.ArgumentError: "it is of another format",
-    errors.DecoderNotFoundError: "its codec is not known",
-    errors.EOFError: "it ends too early",
-    errors.InvalidDataError: "its data are not valid",
-    errors.PatchWelcomeError: "it uses a part of its format that is not known",
+    ffmpeg_errors.ArgumentError: "it is of another format",
+    ffmpeg_errors.DecoderNotFoundError: "its codec is not known",
+    ffmpeg_errors.EOFError: "it ends too early",
+    ffmpeg_errors.InvalidDataError: "its data are not valid",
+    ffmpeg_errors.PatchWelcomeError: "it uses a part of its format that is not known",
 }
 """FFmpeg's errors in plain words; others have its own words."""
 _OPTIONS = {
@@ -259,16 +259,10 @@ def read_frames(stream: VideoStream, name: str, max_frames: int) -> Iterator[Vid
         raise damaged(name, f"{given} of its {shown} frames can be decoded")
 
 
-def to_rgb(
-    stream: VideoStream, frame: VideoFrame, decoding: Decoding, scaler: VideoReformatter
-) -> np.ndarray:
-    """Return a decoded frame of a stream as it is shown: upright RGB `h w 3` of square pixels.
-
-    Frames of a stream share a scaler: a new one needs seconds to prepare for a wide gamut.
-    """
+def to_rgb(stream: VideoStream, frame: VideoFrame, decoding: Decoding) -> np.ndarray:
+    """Return a decoded frame of a stream as it is shown: upright RGB `h w 3` of square pixels."""
     wide = frame.color_primaries in _WIDE_GAMUT and decoding == "accurate"
-    frame_rgb = scaler.reformat(
-        frame,
+    frame_rgb = frame.reformat(
         width=_square_width(stream, frame.width),
         format="rgb24",
         interpolation=_SCALERS[decoding],

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from egosim_jax.annotate import run
 from egosim_jax.annotate.clip import ANNOTATION
 from egosim_jax.annotate.config import AnnotateConfig
 from egosim_jax.cli.__main__ import main
@@ -51,6 +52,7 @@ def test_an_assumed_focal_length_is_said(video, tmp_path, capsys, monkeypatch, o
     focal = 120.0 if options else None
     parts = replace(config().build(), cameras=CameraLadder(rung="static", focal_px=focal))
     monkeypatch.setattr(AnnotateConfig, "build", lambda self: parts)
+    monkeypatch.setattr(run, "_built", {})
     out = tmp_path / "out"
     command = ["data", "annotate", str(video), "--out", str(out), *OPTIONS, *options]
     assert main(command) == ExitCode.DONE

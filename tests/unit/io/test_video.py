@@ -10,6 +10,7 @@ from fractions import Fraction
 import av
 import numpy as np
 import pytest
+from av import error as ffmpeg_errors
 from PIL import Image
 
 from egosim_jax.io import decoding
@@ -143,7 +144,7 @@ def test_a_file_that_is_no_video_is_refused_in_plain_words(content, reader, tmp_
 
 
 def test_every_error_of_ffmpeg_is_put_in_plain_words():
-    kinds = [kind for kind in vars(av.error).values() if isinstance(kind, type)]
+    kinds = [kind for kind in vars(ffmpeg_errors).values() if isinstance(kind, type)]
     kinds = [kind for kind in kinds if issubclass(kind, av.FFmpegError)]
     assert len(kinds) > 30
     for kind in kinds:

@@ -116,8 +116,9 @@ def test_images_are_taken_by_their_time_stamps(world, tmp_path, imported, stamps
 def test_time_stamps_of_too_many_frames_or_with_a_pause_are_refused(
     world, tmp_path, imported, monkeypatch
 ):
+    quick = [*(1e-4 * np.arange(7)), *(0.15 * np.arange(1, 6))]
     write_capture(tmp_path / "pause.r3d", world, frameTimestamps=[*TIMES[:6], *(TIMES[6:] + 1)])
-    write_capture(tmp_path / "many.r3d", world, frameTimestamps=[0, 1e-4, *(0.2 * TIMES)])
+    write_capture(tmp_path / "many.r3d", world, frameTimestamps=quick)
     monkeypatch.setattr(record3d, "MAX_IMAGES", 100)
     done, problems = imported(Record3D(source=tmp_path))
     assert not done
