@@ -37,7 +37,7 @@ from av.container import InputContainer
 from av.packet import Packet
 from av.stream import Disposition
 from av.video.frame import VideoFrame
-from av.video.reformatter import ColorPrimaries, Interpolation
+from av.video.reformatter import ColorPrimaries, Interpolation, VideoReformatter
 from av.video.stream import VideoStream
 
 from egosim_jax.io.bounded import open_regular, quote_path, quote_text
@@ -259,10 +259,16 @@ def read_frames(stream: VideoStream, name: str, max_frames: int) -> Iterator[Vid
         raise damaged(name, f"{given} of its {shown} frames can be decoded")
 
 
-def to_rgb(stream: VideoStream, frame: VideoFrame, decoding: Decoding) -> np.ndarray:
-    """Return a decoded frame of a stream as it is shown: upright RGB `h w 3` of square pixels."""
+def to_rgb(
+    stream: VideoStream, frame: VideoFrame, decoding: Decoding, scaler: VideoReformatter
+) -> np.ndarray:
+    """Return a decoded frame of a stream as it is shown: upright RGB `h w 3` of square pixels.
+
+    Frames of a stream share a scaler: a new one needs seconds to prepare for a wide gamut.
+    """
     wide = frame.color_primaries in _WIDE_GAMUT and decoding == "accurate"
-    frame_rgb = frame.reformat(
+    frame_rgb = scaler.reformat(
+        frame,
         width=_square_width(stream, frame.width),
         format="rgb24",
         interpolation=_SCALERS[decoding],
