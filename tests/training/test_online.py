@@ -93,12 +93,11 @@ def test_a_full_pool_forgets_its_oldest_clips():
         Pool(latent_shapes(DEBUG, CHUNK + 1))
 
 
-@pytest.mark.parametrize("layers", [3, 4])
-def test_a_deeper_denoiser_computes_the_same(tmp_path, layers):
+def test_a_deeper_denoiser_computes_the_same(tmp_path):
     networks = Networks.random(DEBUG, seed=0)
     networks.save(tmp_path / "two")
-    folder = deepen_weights(tmp_path / "two", layers, tmp_path / "deep")
-    deep = abstract(replace(DEBUG.dit, layers=layers))
+    folder = deepen_weights(tmp_path / "two", 3, tmp_path / "deep")
+    deep = abstract(replace(DEBUG.dit, layers=3))
     weights.load(folder / "dit.safetensors", deep)
     draw = np.random.default_rng(0)
     shapes = ((1, 3, 4, 4, 52), (1, 5, DEBUG.dit.text_dim), (1, 5, DEBUG.dit.image_dim))
@@ -113,10 +112,23 @@ def test_a_deeper_denoiser_computes_the_same(tmp_path, layers):
 
 
 def test_grouped_muon_equals_muon_of_each_weight():
-    networks = Networks.random(DEBUG, seed=0)
-    params = nnx.state((networks.dit, networks.text, networks.image), nnx.Param)
     draw = np.random.default_rng(0)
-    gradients = jax.tree.map(lambda x: jnp.asarray(draw.normal(size=x.shape), jnp.float32), params)
+    shapes = {
+        "stacked": ((2, 4, 6), ("layers", "embed", "mlp")),
+        "tall": ((6, 4), ("mlp", "embed")),
+        "convolution": ((3, 2, 4), (None, "embed", "mlp")),
+        "embedding": ((9, 4), ("vocab", "embed")),
+        "bias": ((4,), ("embed",)),
+    }
+
+    def variables_of_random_values():
+        return {
+            name: nnx.Param(jnp.asarray(draw.normal(size=shape), jnp.float32), axes=axes)
+            for name, (shape, axes) in shapes.items()
+        }
+
+    params, gradients = nnx.State(variables_of_random_values()), variables_of_random_values()
+    gradients = nnx.State(gradients)
     config = OptimizerConfig(name="muon", weight_decay=0.05)
 
     def axes(leaf):
