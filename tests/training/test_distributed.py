@@ -1,6 +1,9 @@
 """Joining the processes of a run, and running alone."""
 
+import os
 import socket
+import subprocess
+import sys
 import warnings
 
 import jax
@@ -71,3 +74,29 @@ def test_gloo_beyond_the_loopback_is_said_once(initialized, monkeypatch, address
         with distributed.distributed_context():
             pass
     assert [address in str(warning.message) for warning in said] == [True] * warned
+
+
+@pytest.mark.parametrize(("nodes", "devices"), [(2, ["all", "all"]), (1, ["0", "1"])])
+def test_the_only_task_of_a_machine_has_all_of_its_gpus(nodes, devices):
+    """With jax's own detection of Slurm, which gives each of two tasks one GPU."""
+    code = (
+        "import jax; from egosim_jax.train.distributed import distributed_context\n"
+        "with distributed_context(): print(jax.config.values['jax_cuda_visible_devices'])"
+    )
+    shared = {
+        "SLURM_JOB_ID": str(os.getpid()),  # gives the port
+        "SLURM_STEP_NODELIST": "localhost",
+        "SLURM_NTASKS": "2",
+        "SLURM_STEP_NUM_TASKS": "2",
+        "SLURM_STEP_NUM_NODES": str(nodes),
+    }
+    tasks = [
+        subprocess.Popen(
+            [sys.executable, "-c", code],
+            env=os.environ | shared | {"SLURM_PROCID": index, "SLURM_LOCALID": local},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for index, local in (("0", "0"), ("1", "0" if nodes == 2 else "1"))
+    ]
+    assert [task.communicate(timeout=120)[0].strip() for task in tasks] == devices
