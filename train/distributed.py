@@ -4,10 +4,11 @@ Slurm, Open MPI and TPU pods are recognized by jax. Anywhere else, give every pr
 
     JAX_COORDINATOR_ADDRESS=host:port JAX_NUM_PROCESSES=n JAX_PROCESS_ID=0..n-1
 
-and with none of these a run has one process; `launch` sets them on its machine. The service has no authentication. With an address of
-this machine's loopback it listens on the loopback only; with any other it listens on all
-interfaces, or on `JAX_COORDINATOR_BIND_ADDRESS`, and needs a firewall (docs/security.md). Between
-several processes, jax's collectives of CPUs (gloo) listen at the address of the hostname.
+as `launch` does, and with none of these a run has one process. The service has no authentication.
+With an address of this machine's loopback it listens on the loopback only; with any other it
+listens on all interfaces, or on `JAX_COORDINATOR_BIND_ADDRESS`, and needs a firewall
+(docs/security.md). Between several processes, jax's collectives of CPUs (gloo) listen at the
+address of the hostname.
 """
 
 from __future__ import annotations

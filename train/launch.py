@@ -7,10 +7,6 @@ On several machines, run it on each, with the same --nodes and --coordinator and
 
 from __future__ import annotations
 
-from egosim_jax.runtime import interrupts
-
-interrupts.expect()
-
 import os
 import re
 import signal
