@@ -99,4 +99,4 @@ def test_the_only_task_of_a_machine_has_all_of_its_gpus(nodes, devices):
         )
         for index, local in (("0", "0"), ("1", "0" if nodes == 2 else "1"))
     ]
-    assert [task.communicate(timeout=120)[0].strip() for task in tasks] == devices
+    assert [task.communicate(timeout=300)[0].strip() for task in tasks] == devices

@@ -38,7 +38,7 @@ def test_each_process_gets_its_variables_and_gpus_and_prefixes_its_lines():
     )
     machine = ("--nodes", "2", "--node-rank", "1", "--coordinator", "10.0.0.1:1234")
     process = start(code, "--processes", "2", *machine)
-    out, _ = process.communicate(timeout=60)
+    out, _ = process.communicate(timeout=300)
     assert process.returncode == 0
     assert sorted(out.splitlines()) == ["[2] 10.0.0.1:1234 4 4,5", "[3] 10.0.0.1:1234 4 6,7"]
 
@@ -51,7 +51,7 @@ def test_one_process_fails_and_the_other_is_ended_without_a_restart():
         "--processes",
         "2",
     )
-    out, errors = process.communicate(timeout=60)
+    out, errors = process.communicate(timeout=300)
     assert process.returncode == 2
     assert out == "[0] saved\n"
     assert errors == ""
@@ -68,7 +68,7 @@ def test_a_run_that_can_be_resumed_starts_again(tmp_path: Path, end, says):
         "if first: time.sleep(60)\n"
     )
     process = start(code, "--processes", "2")
-    assert process.communicate(timeout=60) == (
+    assert process.communicate(timeout=300) == (
         "",
         f"a process ended with {says}; restarts left: 10\n",
     )
@@ -77,7 +77,7 @@ def test_a_run_that_can_be_resumed_starts_again(tmp_path: Path, end, says):
 
 def test_restarts_are_limited():
     process = start("say('started'); sys.exit(75)", "--restarts", "1")
-    out, errors = process.communicate(timeout=60)
+    out, errors = process.communicate(timeout=300)
     assert process.returncode == 75
     assert out == "[0] started\n" * 2
     assert errors == "a process ended with 75; restarts left: 1\n"
@@ -93,7 +93,7 @@ def test_sigterm_reaches_the_processes_which_are_not_started_again():
     assert process.stdout is not None
     process.stdout.readline()
     process.send_signal(signal.SIGTERM)
-    process.communicate(timeout=30)
+    process.communicate(timeout=300)
     assert process.returncode == 75
 
 
