@@ -77,7 +77,7 @@ def distributed_context() -> Iterator[None]:
         except ValueError:  # no cluster
             _initialize(free_local_address(), 1, 0)
         else:
-            if _has_machine():
+            if _is_alone_on_machine() and "JAX_LOCAL_DEVICE_IDS" not in os.environ:
                 jax.config.update("jax_cuda_visible_devices", "all")
     try:
         yield
@@ -150,10 +150,10 @@ def _is_launched() -> bool:
     return any(name in os.environ for name in NAMES) or any(count != "1" for count in tasks)
 
 
-def _has_machine() -> bool:
-    """Return True for the only task of Slurm or Open MPI on its machine: it has all of its GPUs.
+def _is_alone_on_machine() -> bool:
+    """Return True for the only task of Slurm or Open MPI on its machine, which has all its GPUs.
 
-    jax gives every task one GPU, by the number of the task on its machine.
+    jax would give it one: GPU 0, as the number of the task on its machine.
     """
     names = ("SLURM_STEP_NUM_TASKS", "SLURM_STEP_NUM_NODES")
     tasks, nodes = (os.environ.get(name) for name in names)
