@@ -63,19 +63,20 @@ class Launch:
 
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, stop)
-        for left in reversed(range(self.restarts + 1)):
+        left = self.restarts + 1
+        while True:
+            left -= 1
             running.clear()
             running.extend(self._start())
             code = _wait(running)
             can_resume = code in (ExitCode.HUNG, ExitCode.RESUBMIT) or code > 128
             if stops or not can_resume or not left:
-                break
+                return code
             print(f"a process ended with {code}; restarts left: {left}", file=sys.stderr)
             if self.nodes > 1:
                 time.sleep(REJOIN_S)
             if stops:
-                break
-        return code
+                return code
 
     def _check(self) -> None:
         if not self.program:

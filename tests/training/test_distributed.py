@@ -76,9 +76,8 @@ def test_gloo_beyond_the_loopback_is_said_once(initialized, monkeypatch, address
     assert [address in str(warning.message) for warning in said] == [True] * warned
 
 
-@pytest.mark.parametrize(("nodes", "devices"), [(2, ["all", "all"]), (1, ["0", "1"])])
-def test_the_only_task_of_a_machine_has_all_of_its_gpus(nodes, devices):
-    """With jax's own detection of Slurm, which gives each of two tasks one GPU."""
+def test_the_only_task_of_a_machine_has_all_of_its_gpus(monkeypatch):
+    """With jax's own detection of Slurm, which gives each task one GPU."""
     code = (
         "import jax; from egosim_jax.train.distributed import distributed_context\n"
         "with distributed_context(): print(jax.config.values['jax_cuda_visible_devices'])"
@@ -88,15 +87,21 @@ def test_the_only_task_of_a_machine_has_all_of_its_gpus(nodes, devices):
         "SLURM_STEP_NODELIST": "localhost",
         "SLURM_NTASKS": "2",
         "SLURM_STEP_NUM_TASKS": "2",
-        "SLURM_STEP_NUM_NODES": str(nodes),
+        "SLURM_STEP_NUM_NODES": "2",
+        "SLURM_LOCALID": "0",
     }
     tasks = [
         subprocess.Popen(
             [sys.executable, "-c", code],
-            env=os.environ | shared | {"SLURM_PROCID": index, "SLURM_LOCALID": local},
+            env=os.environ | shared | {"SLURM_PROCID": index},
             stdout=subprocess.PIPE,
             text=True,
         )
-        for index, local in (("0", "0"), ("1", "0" if nodes == 2 else "1"))
+        for index in ("0", "1")
     ]
-    assert [task.communicate(timeout=300)[0].strip() for task in tasks] == devices
+    assert [task.communicate(timeout=300)[0].strip() for task in tasks] == ["all", "all"]
+    for name, value in shared.items():
+        monkeypatch.setenv(name, value)
+    assert distributed._is_alone_on_machine()
+    monkeypatch.setenv("SLURM_STEP_NUM_NODES", "1")
+    assert not distributed._is_alone_on_machine()
