@@ -63,9 +63,8 @@ class Launch:
 
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, stop)
-        left = self.restarts + 1
+        left = self.restarts
         while True:
-            left -= 1
             running.clear()
             running.extend(self._start())
             code = _wait(running)
@@ -77,6 +76,7 @@ class Launch:
                 time.sleep(REJOIN_S)
             if stops:
                 return code
+            left -= 1
 
     def _check(self) -> None:
         if not self.program:
