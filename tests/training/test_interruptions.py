@@ -142,29 +142,6 @@ def test_two_processes_stop_together_and_resume_bit_for_bit(points, tmp_path):
     assert [line["step"] for line in logged(whole)] == list(range(1, schedule["steps"] + 1))
 
 
-def test_the_launcher_resumes_a_run_whose_process_is_killed(points, straight, tmp_path):
-    out, program = tmp_path / "run", [sys.executable, "-m", "tests.training.line"]
-    launcher = subprocess.Popen(
-        [sys.executable, "-m", "egosim_jax.train.launch", "--processes", "2", "--"]
-        + [*program, str(out), str(points), json.dumps(LONG | {"pause": 0.06})],
-        cwd=ROOT,
-        env=os.environ | flags.devices(1),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-    wait_for(out, 33, launcher)
-    pid = launcher.pid
-    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    os.kill(int(children[1]), signal.SIGKILL)
-    said = launcher.communicate(timeout=600)[0]
-    assert launcher.returncode == ExitCode.DONE, said
-    assert "a process ended with 137; restarts left: 10" in said
-    assert "resuming at step" in said
-    losses = [[line["loss"] for line in log] for log in (logged(out), straight)]
-    np.testing.assert_allclose(*losses, rtol=1e-5)
-
-
 @pytest.mark.parametrize(
     ("given", "said"),
     [
