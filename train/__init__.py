@@ -17,5 +17,6 @@ Networks belong in `models`, the diffusion objective in `diffusion`, shards and 
     monitor, metric_writers       speed, watchdog, skipped updates, sample clips; logs
     run_page                      index.html of a run
     distributed                   processes of a run
+    launch                        start them on machines without a scheduler
     bundle, bundle_writer         training on a machine with few packages
 """

@@ -4,10 +4,11 @@ Slurm, Open MPI and TPU pods are recognized by jax. Anywhere else, give every pr
 
     JAX_COORDINATOR_ADDRESS=host:port JAX_NUM_PROCESSES=n JAX_PROCESS_ID=0..n-1
 
-and with none of these a run has one process. The service has no authentication. With an address of
-this machine's loopback it listens on the loopback only; with any other it listens on all
-interfaces, or on `JAX_COORDINATOR_BIND_ADDRESS`, and needs a firewall (docs/security.md). Between
-several processes, jax's collectives of CPUs (gloo) listen at the address of the hostname.
+as `launch` does, and with none of these a run has one process. The service has no authentication.
+With an address of this machine's loopback it listens on the loopback only; with any other it
+listens on all interfaces, or on `JAX_COORDINATOR_BIND_ADDRESS`, and needs a firewall
+(docs/security.md). Between several processes, jax's collectives of CPUs (gloo) listen at the
+address of the hostname.
 """
 
 from __future__ import annotations
@@ -75,6 +76,9 @@ def distributed_context() -> Iterator[None]:
             )
         except ValueError:  # no cluster
             _initialize(free_local_address(), 1, 0)
+        else:
+            if _is_alone_on_machine() and "JAX_LOCAL_DEVICE_IDS" not in os.environ:
+                jax.config.update("jax_cuda_visible_devices", "all")
     try:
         yield
     except CommandExit:  # all processes stop at the same step
@@ -146,6 +150,17 @@ def _is_launched() -> bool:
     return any(name in os.environ for name in NAMES) or any(count != "1" for count in tasks)
 
 
+def _is_alone_on_machine() -> bool:
+    """Return True for the only task of Slurm or Open MPI on its machine, which has all its GPUs.
+
+    jax would give it one: GPU 0, as the number of the task on its machine.
+    """
+    names = ("SLURM_STEP_NUM_TASKS", "SLURM_STEP_NUM_NODES")
+    tasks, nodes = (os.environ.get(name) for name in names)
+    alone = tasks is not None and tasks == nodes
+    return alone or os.environ.get("OMPI_COMM_WORLD_LOCAL_SIZE") == "1"
+
+
 def _may_have_peers() -> bool:
     """Return True in a process of a launcher, or on a TPU of several machines in Kubernetes."""
     return _is_launched() or "," in os.environ.get("TPU_WORKER_HOSTNAMES", "")
@@ -158,6 +173,8 @@ def _initialize(address: str, count: int, index: int) -> None:
         "coordinator_bind_address": address if local else None,
         "initialization_timeout": JOIN_S,
         "shutdown_timeout_seconds": FINISH_S,
+        # All is given; detection would add one GPU a process on Slurm, and warn on Kubernetes.
+        "cluster_detection_method": "deactivate",
     }
     if count == 1:
         # One process sends nothing to others. Gloo, the default, would listen all the same.

@@ -75,7 +75,7 @@ def preflight(stages: Mapping[str, Stage], name: str, *, as_json: bool, search: 
         fit &= report.fits
         found[title] = {"hosts": [asdict(host) for host in hosts], "asked": plain(report)}
         if not as_json:
-            print(text(report), flush=True)
+            print(f"{text(report)}\n{_host_memory(hosts, report)}", flush=True)
         # Settings are ordered by predicted speed, so a search needs the device's peak.
         known_speed = not math.isnan(target.device.flops)
         if search and isinstance(stage.task, Denoising) and known_speed:
@@ -190,6 +190,13 @@ def _rows(hosts: Sequence[Host]) -> str:
     lines = [f"    {group:<{width}}{rows}" for group, rows in named.items()]
     each = ", ".join(sorted({str(host.devices) for host in hosts}))
     return "\n".join([f"  rows of the batch by host, {each} devices each", *lines])
+
+
+def _host_memory(hosts: Sequence[Host], report: Report | OutOfMemory) -> str:
+    """Format the memory that the devices of each host need together; all hosts have as many."""
+    peak = report.memory.peak if isinstance(report, Report) else report.needs
+    each = hosts[0].devices
+    return f"  {'a host':<16}{each} devices, {size(each * peak)} of {size(each * report.capacity)}"
 
 
 def _ranges(numbers: Sequence[int]) -> str:

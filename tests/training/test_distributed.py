@@ -1,6 +1,9 @@
 """Joining the processes of a run, and running alone."""
 
+import os
 import socket
+import subprocess
+import sys
 import warnings
 
 import jax
@@ -71,3 +74,34 @@ def test_gloo_beyond_the_loopback_is_said_once(initialized, monkeypatch, address
         with distributed.distributed_context():
             pass
     assert [address in str(warning.message) for warning in said] == [True] * warned
+
+
+def test_the_only_task_of_a_machine_has_all_of_its_gpus(monkeypatch):
+    """With jax's own detection of Slurm, which gives each task one GPU."""
+    code = (
+        "import jax; from egosim_jax.train.distributed import distributed_context\n"
+        "with distributed_context(): print(jax.config.values['jax_cuda_visible_devices'])"
+    )
+    shared = {
+        "SLURM_JOB_ID": str(os.getpid()),  # gives the port
+        "SLURM_STEP_NODELIST": "localhost",
+        "SLURM_NTASKS": "2",
+        "SLURM_STEP_NUM_TASKS": "2",
+        "SLURM_STEP_NUM_NODES": "2",
+        "SLURM_LOCALID": "0",
+    }
+    tasks = [
+        subprocess.Popen(
+            [sys.executable, "-c", code],
+            env=os.environ | shared | {"SLURM_PROCID": index},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for index in ("0", "1")
+    ]
+    assert [task.communicate(timeout=300)[0].strip() for task in tasks] == ["all", "all"]
+    for name, value in shared.items():
+        monkeypatch.setenv(name, value)
+    assert distributed._is_alone_on_machine()
+    monkeypatch.setenv("SLURM_STEP_NUM_NODES", "1")
+    assert not distributed._is_alone_on_machine()

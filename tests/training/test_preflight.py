@@ -53,6 +53,7 @@ def test_a_recipe_is_compiled_without_any_file(tmp_path, monkeypatch, capsys):
     assert "denoiser on cpu:1, 1 x cpu: batch 2" in printed
     assert printed.count("rows of the batch by host, 1 devices each\n    0  0, 1\n") == 2
     assert printed.count(": fits") == 2
+    assert printed.count("\n  a host          1 devices, ") == 2
     assert not list(tmp_path.iterdir())
 
 
