@@ -181,6 +181,11 @@ def test_the_schedule_falls_to_a_hundredth():
     assert [schedule(share) for share in (0.0, 0.5, 1.0)] == pytest.approx([1, 0.5, 0.01])
 
 
+def test_a_training_without_an_end_is_refused(tmp_path):
+    with pytest.raises(InputError, match="needs an end"):
+        OnlineTraining(model=DEBUG, start=tmp_path, out=tmp_path)
+
+
 @pytest.mark.slow
 def test_a_run_is_the_same_in_programs_of_one_and_of_two_updates(tmp_path):
     Networks.random(DEBUG, seed=0).save(tmp_path / "start")

@@ -11,6 +11,7 @@ from egosim_jax.configs.model import ModelConfig
 from egosim_jax.diffusion.objective import Objective
 from egosim_jax.train.tasks.denoising import Denoising
 from egosim_jax.train.tasks.refining import Refining
+from egosim_jax.types import InputError, check_counts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +72,13 @@ class OnlineTraining:
     """Seconds between validations."""
     save_s: float = 120.0
     """Seconds between writings of the weights."""
+
+    def __post_init__(self) -> None:
+        """Raise `InputError` without an end, and for counts below 1."""
+        if self.minutes is None and self.updates is None:
+            raise InputError("A training needs an end: give minutes or updates. (--minutes)")
+        counts = ("batch", "per_program", "decoder_batch", "first_clips", "clips", "frames")
+        check_counts({name: getattr(self, name) for name in counts})
 
     @property
     def layers(self) -> int:

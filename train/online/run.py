@@ -44,6 +44,7 @@ from egosim_jax.train.online.updates import (
     make_generate,
     make_judge,
 )
+from egosim_jax.types import InputError
 
 WARMUP = 300
 """Updates of linear warm-up of the denoiser; the decoder has a third."""
@@ -77,7 +78,6 @@ class OnlineRun:
         self.pool = Pool(latent_shapes(model, plan.clips))
         self.frames = Pool(self._frame_shapes())
         self.read: set[Path] = set()
-        self.held: dict[str, np.ndarray] = {}
 
     def _frame_shapes(self) -> dict[str, jax.ShapeDtypeStruct]:
         count, model = self.plan.frames, self.plan.model
@@ -166,7 +166,12 @@ class OnlineRun:
 
     def _wait_for_clips(self, clips: Clips) -> None:
         self._admit(clips, limit=10**6)
-        while len(self.pool) < min(self.plan.first_clips, self.plan.clips):
+        while len(self.pool) < (wanted := min(self.plan.first_clips, self.plan.clips)):
+            if not self.plan.workers:
+                raise InputError(
+                    f"There are {len(self.pool)} clips and no process makes more: {wanted} must be "
+                    "there before the first update. (--latents, --workers, --first-clips)"
+                )
             time.sleep(0.2)
             self._admit(clips, limit=8)
 
