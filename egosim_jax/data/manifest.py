@@ -88,8 +88,11 @@ def read_manifest(folder: Path) -> Manifest:
     path = folder / MANIFEST
     if not path.is_file():
         raise InputError(f"{quote_path(folder)} is not a dataset: it has no {MANIFEST}.")
-    fields = read_json(path)
-    name = quote_path(path)
+    return parse_manifest(read_json(path), quote_path(path))
+
+
+def parse_manifest(fields: Any, name: str) -> Manifest:
+    """Validate the JSON of a manifest. Raises `InputError`, naming `name`, if it is invalid."""
     try:
         manifest = _manifest(fields, name)
     except InputError:
