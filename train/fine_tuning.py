@@ -100,31 +100,31 @@ class FineTuning(Recipe):
         model = self.model()
         check_folder(weights, model.name)
         latents = self._local_shards(latents)
-        validation = self.validation and self._local_shards(self.validation)
+        validation = None if self.validation is None else self._local_shards(self.validation)
         for shards in (latents, validation):
-            if shards:
+            if shards is not None:
                 check_encoders(shards, model, weights)
         trained = train(
             *self.stages()["training"],
             data=latents,
-            validation=validation or None,
+            validation=validation,
             out=out,
             weights=weights,
-            samples=Samples(model=model, latents=validation, vae=weights, count=self.samples)
-            if validation
-            else None,
+            samples=validation
+            and Samples(model=model, latents=validation, vae=weights, count=self.samples),
         )
         print(write_trained(trained, out, model=model, start=weights, rank=self.rank))
         return ExitCode.DONE
 
     def _local_shards(self, shards: str | Path) -> Path:
-        """Return a folder of shards on this machine, when all processes have theirs."""
+        """Return a folder of shards; after a copy from a store, when all processes have theirs."""
         from egosim_jax.data.stores import local_shards
         from egosim_jax.train.distributed import wait_for_all
 
         check_counts({"--cache-gb": self.cache_gb})
         folder = local_shards(shards, cache=self.cache, limit=self.cache_gb * 10**9)
-        wait_for_all(f"shards {shards}")
+        if folder != Path(shards):
+            wait_for_all(f"shards {shards}")
         return folder
 
     def model(self) -> ModelConfig:
