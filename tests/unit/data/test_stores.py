@@ -20,7 +20,7 @@ from egosim_jax.runtime.command import ExitCode, ProcessExit
 from egosim_jax.types import InputError
 from tests.unit.data.latent_records import write_latents
 
-SECRET = "cXVpdGUgc2VjcmV0"
+SECRET = "cXVpdGUgc2VjcmV0"  # noqa: S105
 
 
 class Broken:
