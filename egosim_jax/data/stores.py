@@ -54,7 +54,7 @@ def local_shards(
 ) -> Path:
     """Return the folder of shards: the given one, or the copy in `cache` of those at an address.
 
-    Copies what is missing there. `cache` is by default in the user's cache folder, and holds at
+    Missing shards are copied there. `cache` is by default in the user's cache folder, and holds at
     most `limit` bytes. One process at a time copies to it; the others wait, and find the copy.
     Raises `InputError` if the store refuses, or holds no valid shards or more than fits, and
     `ProcessExit` if transfers fail repeatedly.

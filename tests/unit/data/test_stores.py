@@ -42,7 +42,7 @@ class Broken:
         return self.app(environ, start_response)
 
     def half(self, environ, start_response):
-        """Half of an answer, whose connection then breaks."""
+        """Half of a body, whose connection then breaks."""
         body = b"".join(self.app(environ, start_response))
         yield body[: len(body) // 2]
         environ["werkzeug.socket"].shutdown(socket.SHUT_RDWR)
