@@ -119,7 +119,7 @@ def _manifest(fields: Any, name: str) -> Manifest:
     for shard in shards:
         if not (isinstance(shard.file, str) and isinstance(shard.sha256, str)):
             raise TypeError("a shard has no file name or sha256")
-        if not (type(shard.size) is type(shard.records) is int and shard.size < 1 << 48):
+        if not (type(shard.size) is type(shard.records) is int and 0 <= shard.size < 1 << 48):
             raise TypeError("the size or number of records of a shard is not an integer")
     unsafe = [quote(shard.file) for shard in shards if not SHARD_NAME.fullmatch(shard.file)]
     files = {shard.file for shard in shards}
