@@ -100,6 +100,7 @@ class _Store:
 
         Raises `FileNotFoundError`, `PermissionError`, or `ConnectionError` after the last try.
         """
+        failure: Exception | None = None
         for attempt in range(TRIES):
             if attempt:
                 time.sleep(WAIT_S * 2 ** (attempt - 1))
