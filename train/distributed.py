@@ -27,8 +27,9 @@ from typing import Any
 
 import jax
 from jax.experimental import multihost_utils
+from orbax.checkpoint import multihost
 
-from egosim_jax.runtime.command import CommandExit, ExitCode, run_with_exit_codes
+from egosim_jax.runtime.command import CommandExit, ExitCode, ProcessExit, run_with_exit_codes
 from egosim_jax.train.peers import HEARTBEAT_S, PEER_DIED, is_peer_failure, run_in_child
 from egosim_jax.types import InputError
 
@@ -42,6 +43,10 @@ JOIN_S = 300
 """Time for which processes wait at the start for the last one, in seconds."""
 FINISH_S = 3600
 """Time for which processes wait at the end for the last one, which may write weights, in seconds.
+
+A process that dies meanwhile is noticed as at any other time."""
+FETCH_S = 86_400
+"""Time for which processes wait for the last one, which may copy data to its machine, in seconds.
 
 A process that dies meanwhile is noticed as at any other time."""
 LEAVE_S = 10.0
@@ -81,10 +86,10 @@ def distributed_context() -> Iterator[None]:
                 jax.config.update("jax_cuda_visible_devices", "all")
     try:
         yield
-    except CommandExit:  # all processes stop at the same step
-        jax.distributed.shutdown()
-        raise
     except BaseException as error:
+        if isinstance(error, CommandExit) and not isinstance(error, ProcessExit):
+            jax.distributed.shutdown()  # all processes stop at the same step
+            raise
         _leave(error)
         raise
     jax.distributed.shutdown()
@@ -122,6 +127,13 @@ def _leave(error: BaseException) -> None:
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)
+
+
+def wait_for_all(name: str) -> None:
+    """Wait until all processes of a run call this, each once for a name, and no device is used."""
+    if jax.process_count() > 1:
+        everyone = set(range(jax.process_count()))
+        multihost.sync_global_processes(name, processes=everyone, timeout=FETCH_S)
 
 
 def is_preempted() -> bool:

@@ -13,7 +13,7 @@ from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.train.config import TrainConfig
 from egosim_jax.train.recipe import Recipe
 from egosim_jax.train.update import Stage
-from egosim_jax.types import InputError
+from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:
     from egosim_jax.configs.model import ModelConfig, Networks
@@ -29,6 +29,7 @@ class FineTuning(Recipe):
 
     help_groups: ClassVar[HelpGroups] = {
         "preflight report": ("json", "search"),
+        "object stores": ("cache", "cache_gb"),
         "method": (
             "rank",
             "times",
@@ -44,12 +45,16 @@ class FineTuning(Recipe):
     """Name of the model."""
     training: TrainConfig
     """Hyper-parameters of the denoiser's training."""
-    latents: Path | None = None
-    """Folder of latents shards."""
+    latents: str | Path | None = None
+    """Folder of latents shards, or its address: s3://BUCKET/FOLDER or gs://BUCKET/FOLDER."""
     weights: Path | None = None
     """Weights folder to start from, with the encoders that made the latents."""
-    validation: Path | None = None
-    """Folder of latents shards for validation and sample clips."""
+    validation: str | Path | None = None
+    """Folder or address of latents shards for validation and sample clips."""
+    cache: Path | None = None
+    """Folder for copies of shards at addresses; None: in the user's cache folder."""
+    cache_gb: int = 1000
+    """Maximum size of these copies in GB."""
     rank: int | None = None
     """Rank of a LoRA to train instead of the weights."""
     times: Literal["uniform", "logit-normal", "diffsynth"] = "diffsynth"
@@ -94,20 +99,33 @@ class FineTuning(Recipe):
 
         model = self.model()
         check_folder(weights, model.name)
-        for shards in (latents, self.validation):
+        latents = self._local_shards(latents)
+        validation = None if self.validation is None else self._local_shards(self.validation)
+        for shards in (latents, validation):
             if shards is not None:
                 check_encoders(shards, model, weights)
         trained = train(
             *self.stages()["training"],
             data=latents,
-            validation=self.validation,
+            validation=validation,
             out=out,
             weights=weights,
-            samples=self.validation
-            and Samples(model=model, latents=self.validation, vae=weights, count=self.samples),
+            samples=validation
+            and Samples(model=model, latents=validation, vae=weights, count=self.samples),
         )
         print(write_trained(trained, out, model=model, start=weights, rank=self.rank))
         return ExitCode.DONE
+
+    def _local_shards(self, shards: str | Path) -> Path:
+        """Return a folder of shards; after a copy from a store, when all processes have theirs."""
+        from egosim_jax.data.stores import local_shards
+        from egosim_jax.train.distributed import wait_for_all
+
+        check_counts({"--cache-gb": self.cache_gb})
+        folder = local_shards(shards, cache=self.cache, limit=self.cache_gb * 10**9)
+        if folder != Path(shards):
+            wait_for_all(f"shards {shards}")
+        return folder
 
     def model(self) -> ModelConfig:
         """Return the model's config with the options of this recipe.

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from egosim_jax.io.executables import share_with_jax
 from egosim_jax.train.update import Stage
@@ -45,8 +46,8 @@ class Recipe(ABC):
         compile_offline()
         return preflight(self.stages(), self.preflight, as_json=self.json, search=self.search)
 
-    def require(self, *names: str) -> list[Path]:
-        """Return paths that only training needs. Raises `InputError` if one is not given."""
+    def require(self, *names: str) -> list[Any]:
+        """Return options that only training needs. Raises `InputError` if one is not given."""
         if missing := [name for name in names if getattr(self, name) is None]:
             options = ", ".join(f"--{name}" for name in missing)
             raise InputError(f"Missing {options}: required to train. Only --preflight needs none.")

@@ -37,6 +37,8 @@ EXTRAS = {
     "OpenEXR": "recorded",
     "tensorboardX": "tensorboard",
     "wandb": "wandb",
+    "s3fs": "stores",
+    "gcsfs": "stores",
 }
 """Optional module -> extra that installs it."""
 NATIVE = ("open3d", "cv2", "av")

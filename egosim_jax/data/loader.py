@@ -20,6 +20,7 @@ stretch of the sequence therefore has the proportions of the weights.
 from __future__ import annotations
 
 import logging
+import re
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -36,6 +37,7 @@ from egosim_jax.data.manifest import Manifest
 from egosim_jax.data.mixing import Mixture
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.io.bounded import listing, named
+from egosim_jax.runtime.command import ExitCode, ProcessExit
 from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import InputError
 
@@ -43,6 +45,8 @@ logger = logging.getLogger(__name__)
 
 LATENTS = ("target", "prior", "hands", "mask")
 """Arrays of a latents record with latent frames, rows and columns."""
+_DEATH = re.compile(r"Worker process was terminated unexpectedly with exit code (-?\d+)")
+"""Grain's error for a worker process that ended by itself."""
 _THREADS = 4
 _READING = grain.ReadOptions(num_threads=_THREADS, prefetch_buffer_size=2 * _THREADS)
 
@@ -195,7 +199,18 @@ class Loader:
         return self
 
     def __next__(self) -> dict[str, np.ndarray]:
-        batch = next(self._batches)
+        """Raise `ProcessExit` if a worker process has died."""
+        try:
+            batch = next(self._batches)
+        except RuntimeError as error:
+            if (death := _DEATH.search(str(error))) is None:
+                raise
+            raise ProcessExit(
+                f"A worker process that reads data has died with exit code {death[1]} (-9: killed, "
+                "often because memory ran out). Run the same command again, or with fewer workers. "
+                "(--training.workers)",
+                ExitCode.RESUBMIT,
+            ) from error
         self._read += 1
         return batch
 

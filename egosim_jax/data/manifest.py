@@ -88,8 +88,11 @@ def read_manifest(folder: Path) -> Manifest:
     path = folder / MANIFEST
     if not path.is_file():
         raise InputError(f"{quote_path(folder)} is not a dataset: it has no {MANIFEST}.")
-    fields = read_json(path)
-    name = quote_path(path)
+    return parse_manifest(read_json(path), quote_path(path))
+
+
+def parse_manifest(fields: Any, name: str) -> Manifest:
+    """Validate the JSON of a manifest. Raises `InputError`, naming `name`, if it is invalid."""
     try:
         manifest = _manifest(fields, name)
     except InputError:
@@ -116,7 +119,7 @@ def _manifest(fields: Any, name: str) -> Manifest:
     for shard in shards:
         if not (isinstance(shard.file, str) and isinstance(shard.sha256, str)):
             raise TypeError("a shard has no file name or sha256")
-        if not (type(shard.size) is type(shard.records) is int and shard.size < 1 << 48):
+        if not (type(shard.size) is type(shard.records) is int and 0 <= shard.size < 1 << 48):
             raise TypeError("the size or number of records of a shard is not an integer")
     unsafe = [quote(shard.file) for shard in shards if not SHARD_NAME.fullmatch(shard.file)]
     files = {shard.file for shard in shards}

@@ -55,6 +55,10 @@ class CommandExit(Exception):  # noqa: N818 - an early exit need not be an error
         self.code = code
 
 
+class ProcessExit(CommandExit):
+    """Early end of one process of a run, which the others learn from its end."""
+
+
 HelpGroups = Mapping[str, tuple[str, ...]]
 """Fields of a command by the title of their group in `--help`.
 

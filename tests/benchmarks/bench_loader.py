@@ -12,8 +12,12 @@ caller's own, when asked. The loaders take turns, so that a busy neighbor slows 
 round gives one ratio, ours to theirs. What a loader had prepared while the other's turn lasted is
 thrown away first.
 
-Then the `tabletop` model is trained on the latents, as the trainer does it: the next batch is asked
-for while the devices are at work.
+Then a model is trained on the latents, as the trainer does it: the next batch is asked for while
+the devices are at work. It is also trained one epoch each on latents in several places, which take
+turns; opening and copying them counts. The ratios are to the local shards of the same round.
+
+    shared folder    no file is in the page cache, and each record is read 5 ms late, as by NFS
+    object store     a local server of S3's protocol, without a copy, and with one of before
 
 Without folders, small ones are made: of clips of the tabletop world, and of random latents, since
 what they hold does not change how they are read.
@@ -23,20 +27,23 @@ what they hold does not change how they are read.
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Iterator
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, mkdtemp
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import tyro
 
 from egosim_jax.data.loader import make_loader
+from egosim_jax.data.records import Record
 from egosim_jax.data.shards import ShardReader, ShardWriter
+from egosim_jax.data.stores import local_shards
 from egosim_jax.data.transforms import DecodeWindow
 
 if TYPE_CHECKING:
@@ -45,6 +52,8 @@ if TYPE_CHECKING:
 BATCH = 8
 CLIPS, LATENTS = 16, 256
 """Records that are made, if no folders are given."""
+LATENCY_S = 0.005
+"""Wait before each read of a shared folder, in seconds."""
 GOAL = 0.01
 """Share of a training step that may be spent waiting for data."""
 
@@ -63,6 +72,8 @@ def main(
     rounds: int = 5,
     workers: tuple[int, ...] = (0, 2),
     steps: int = 30,
+    model: str = "tabletop",
+    only_places: bool = False,
 ) -> None:
     """Time both loaders, then training.
 
@@ -73,13 +84,18 @@ def main(
         rounds: Turns of each.
         workers: Numbers of worker processes to try; 0 for none.
         steps: Training steps.
+        model: Config of the model to train.
+        only_places: Only compare the places of latents.
     """
     if min(seconds, rounds, steps) <= 0:
         raise SystemExit("--seconds, --rounds and --steps must be positive.")
     from egosim_jax import configs
 
-    config = configs.get("tabletop")
+    config = configs.get(model)
     with TemporaryDirectory() as folder:
+        if only_places:
+            compare_places(config, latents or make_latents(config, Path(folder)), rounds)
+            return
         sources = {
             "videos": ShardReader(videos or make_videos(config, Path(folder))),
             "latents": ShardReader(latents or make_latents(config, Path(folder))),
@@ -89,6 +105,7 @@ def main(
             for count in workers:
                 compare(f"{name}, {count} workers", source, decode[name], count, seconds, rounds)
         report_waiting(config, sources["latents"], steps)
+        compare_places(config, sources["latents"].folder, rounds)
 
 
 def compare(
@@ -171,8 +188,8 @@ def stacked(examples: list[dict[str, np.ndarray]]) -> dict[str, Any]:
     }
 
 
-def report_waiting(config: ModelConfig, source: ShardReader, steps: int) -> None:
-    """Train, and print which share of the time went into waiting for batches."""
+def make_trainer(config: ModelConfig) -> Callable[[Iterator[Any], int], tuple[float, float]]:
+    """Return a function that trains some steps; it returns the seconds, in all and waiting."""
     import jax
     from flax import nnx
 
@@ -182,13 +199,13 @@ def report_waiting(config: ModelConfig, source: ShardReader, steps: int) -> None
 
     task = Denoising(model=config)
     graph, params, frozen = nnx.split(task.networks(nnx.Rngs(0)), task.trained, ...)
-    training = TrainConfig(steps=steps, optimizer=OptimizerConfig(name="muon"))
+    training = TrainConfig(steps=1, optimizer=OptimizerConfig(name="muon"))
     update = jax.jit(make_update(task, graph, training), donate_argnums=0)
     state = TrainState.create(params, training.optimizer)
-    with closing(make_loader(source, batch_size=BATCH, seed=0)) as batches:
-        state, before = update(state, frozen, jax.device_put(next(batches)))
-        jax.block_until_ready(state)
-        start, waited = time.perf_counter(), 0.0
+
+    def train(batches: Iterator[Any], steps: int) -> tuple[float, float]:
+        nonlocal state
+        start, waited, before = time.perf_counter(), 0.0, None
         for _ in range(steps):
             asked = time.perf_counter()
             examples = next(batches)
@@ -197,12 +214,94 @@ def report_waiting(config: ModelConfig, source: ShardReader, steps: int) -> None
             jax.block_until_ready(before)
             before = metrics
         jax.block_until_ready(state)
-        total = time.perf_counter() - start
+        return time.perf_counter() - start, waited
+
+    return train
+
+
+def report_waiting(config: ModelConfig, source: ShardReader, steps: int) -> None:
+    """Train, and print which share of the time went into waiting for batches."""
+    train = make_trainer(config)
+    with closing(make_loader(source, batch_size=BATCH, seed=0)) as batches:
+        train(batches, 1)
+        total, waited = train(batches, steps)
     print(
         f"training: {waited / total:.3%} of {steps} steps of {total / steps:.2f} s waiting for "
         f"data ({1000 * waited / steps:.2f} ms a step); "
         f"goal below {GOAL:.0%}: {'met' if waited < GOAL * total else 'MISSED'}"
     )
+
+
+class SharedFolder(ShardReader):
+    """A folder as on a file server: nothing is in memory, and every read waits for the network."""
+
+    def __init__(self, folder: Path):
+        super().__init__(folder)
+        for shard in self.manifest.shards:
+            with (folder / shard.file).open("rb") as file:
+                os.fsync(file.fileno())
+                os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+
+    def __getitem__(self, index: int) -> Record:
+        time.sleep(LATENCY_S)
+        return super().__getitem__(index)
+
+
+def compare_places(config: ModelConfig, latents: Path, rounds: int) -> None:
+    """Train an epoch on latents in each place, in turns, and print the ratios of the speeds."""
+    train = make_trainer(config)
+    with closing(make_loader(ShardReader(latents), batch_size=BATCH, seed=0)) as batches:
+        train(batches, 1)
+    with store_of(latents) as address, TemporaryDirectory() as cache:
+        places: dict[str, Callable[[], ShardReader]] = {
+            "local shards": lambda: ShardReader(latents),
+            "shared folder": lambda: SharedFolder(latents),
+            "object store, first epoch": lambda: ShardReader(
+                local_shards(address, cache=Path(mkdtemp(dir=cache)))
+            ),
+            "object store, copied before": lambda: ShardReader(
+                local_shards(address, cache=Path(cache, "kept"))
+            ),
+        }
+        places["object store, copied before"]()
+        speeds: dict[str, list[float]] = {name: [] for name in places}
+        for turn in range(rounds):
+            for name in list(places)[:: -1 if turn % 2 else 1]:
+                start = time.perf_counter()
+                source = places[name]()
+                with closing(make_loader(source, batch_size=BATCH, seed=turn)) as batches:
+                    train(batches, len(source) // BATCH)
+                speeds[name].append(len(source) / (time.perf_counter() - start))
+    size = sum(shard.size for shard in ShardReader(latents).manifest.shards)
+    print(f"an epoch of {size / 1e6:.0f} MB of latents, training {config.name}:")
+    for name, found in speeds.items():
+        ratios = [own / local for own, local in zip(found, speeds["local shards"], strict=True)]
+        print(
+            f"  {name}: {median(found):.1f} samples/s, ratio {median(ratios):.3f} "
+            f"[{min(ratios):.3f}, {max(ratios):.3f}] ({rounds} rounds)",
+            flush=True,
+        )
+
+
+@contextmanager
+def store_of(folder: Path) -> Iterator[str]:
+    """Serve a folder as an object store on this machine; its address."""
+    from moto.server import ThreadedMotoServer
+    from s3fs import S3FileSystem
+
+    server = ThreadedMotoServer("127.0.0.1", 0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    os.environ |= {
+        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
+        "AWS_ACCESS_KEY_ID": "id",
+        "AWS_SECRET_ACCESS_KEY": "key",
+    }
+    files = S3FileSystem(skip_instance_cache=True)
+    files.mkdir("bucket")
+    files.put(f"{folder}/", "bucket/latents/", recursive=True)
+    yield "s3://bucket/latents"
+    server.stop()
 
 
 def make_videos(config: ModelConfig, folder: Path) -> Path:

@@ -23,8 +23,8 @@ def latents(index, shape=(3, 4, 6, 16)):
     }
 
 
-def write_latents(folder):
-    """Write seven records of latents in several shards; return the folder."""
+def write_latents(folder, records=7):
+    """Write records of latents in several shards; return the folder."""
     with ShardWriter(
         folder,
         kind="latents",
@@ -32,7 +32,7 @@ def write_latents(folder):
         provenance={"vae": "abc"},
         shard_bytes=13_000,
     ) as writer:
-        for index in range(7):
+        for index in range(records):
             writer.add(latents(index), {"video_id": f"clip{index}", "prompt": f"é {index}"})
     return folder
 

@@ -1,5 +1,8 @@
 """The order of the data: by seed alone, shared by processes, resumed exactly."""
 
+import multiprocessing
+from contextlib import closing
+
 import grain
 import numpy as np
 import pytest
@@ -8,6 +11,7 @@ from egosim_jax.data.loader import Loader, make_loader, one_pass
 from egosim_jax.data.records import to_bytes
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.data.transforms import DecodeWindow
+from egosim_jax.runtime.command import ExitCode, ProcessExit
 from egosim_jax.types import WAN_GRID, InputError, VideoSpec
 
 RECORDS = 12
@@ -44,6 +48,16 @@ def test_every_epoch_holds_every_record_once_in_another_order(source):
     first, second = numbers(loader, 2)
     assert sorted(first) == sorted(second) == list(range(RECORDS))
     assert first != second
+
+
+def test_a_dead_worker_process_ends_the_loader_with_a_code_to_run_again(source):
+    with closing(make_loader(source, batch_size=4, seed=0, workers=1)) as loader:
+        next(loader)
+        (worker,) = multiprocessing.active_children()
+        worker.kill()
+        with pytest.raises(ProcessExit, match=r"has died with exit code -9") as caught:
+            numbers(loader, 10_000)
+    assert caught.value.code == ExitCode.RESUBMIT
 
 
 def test_the_same_seed_gives_the_same_order(source):
