@@ -14,7 +14,7 @@ from egosim_jax import configs
 from egosim_jax.configs.model import Networks
 from egosim_jax.diffusion.objective import Objective
 from egosim_jax.diffusion.process import RectifiedFlow
-from egosim_jax.io import weights
+from egosim_jax.io import parts, weights
 from egosim_jax.models import abstract
 from egosim_jax.train.config import OptimizerConfig, make_optimizer
 from egosim_jax.train.deepen import deepen_weights
@@ -207,4 +207,5 @@ def test_a_run_is_the_same_in_programs_of_one_and_of_two_updates(tmp_path):
     assert int(one.state.step) == int(two.state.step) == 4
     for a, b in zip(*(jax.tree.leaves(run.state.params) for run in (one, two)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)
-    assert (tmp_path / "one" / "weights" / "parts.json").exists()
+    parts.join(tmp_path / "one" / "weights", tmp_path / "joined")
+    Networks.load(model, tmp_path / "joined")

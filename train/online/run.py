@@ -326,8 +326,9 @@ class OnlineRun:
 
     def save(self) -> None:
         """Write the averaged weights of all networks, as parts of at most 16 MiB."""
-        networks = nnx.merge(self.graph, self.state.average)
-        networks.vae = nnx.merge(self.vae_graph, self.decoder_state.average, self.frozen).vae
+        trained = nnx.merge(self.graph, self.state.average)
+        vae: Any = nnx.merge(self.vae_graph, self.decoder_state.average, self.frozen).vae
+        networks = Networks(dit=trained.dit, text=trained.text, image=trained.image, vae=vae)
         with TemporaryDirectory(dir=self.plan.out) as folder:
             networks.save(Path(folder), dtype="float16")
             files = sorted(Path(folder).glob("*.safetensors"))
