@@ -22,6 +22,7 @@ import numpy as np
 
 import egosim_jax
 from egosim_jax import configs
+from egosim_jax.data.records import stacked
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.io.atomic import atomic_folder
 from egosim_jax.io.digest import sha256
@@ -120,15 +121,11 @@ def _shards(source: ShardReader) -> Iterator[dict[str, Any]]:
         arrays = {name: _stored(array) for name, array in record.arrays.items()}
         row = sum(array.nbytes for array in arrays.values())
         if rows and size + row > SHARD_BYTES - HEADER_BYTES:
-            yield _stacked(rows)
+            yield stacked(rows)
             rows, size = [], 0
         rows.append(arrays)
         size += row
-    yield _stacked(rows)
-
-
-def _stacked(rows: list[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+    yield stacked(rows)
 
 
 def _stored(array: np.ndarray) -> np.ndarray:

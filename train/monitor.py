@@ -26,7 +26,7 @@ from jax.experimental import multihost_utils
 from egosim_jax.conditioning.pixels import to_uint8
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.data.mixing import Mixture, open_shards
-from egosim_jax.data.records import Record
+from egosim_jax.data.records import Record, stacked
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.generation.generator import denoise
 from egosim_jax.preflight.targets import peak
@@ -280,7 +280,7 @@ class Samples:
         size = -(-len(found) // parts("batch")) * parts("batch")
         where = batch_sharding(jax.sharding.get_mesh())
         rows = list(islice(cycle(found), size))
-        arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+        arrays = stacked(rows)
         return {
             name: jax.make_array_from_callback(array.shape, where, array.__getitem__)
             for name, array in arrays.items()

@@ -6,7 +6,7 @@ The header of the file holds the record's metadata as JSON.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,3 +61,8 @@ def from_bytes(data: bytes, *, name: str = "the record") -> Record:
     except (safetensors.SafetensorError, KeyError, TypeError, AttributeError, ValueError) as error:
         raise RecordError(f"{name} is not a valid record: {quote_text(str(error))}.") from error
     return Record(arrays=arrays, metadata=metadata)
+
+
+def stacked(rows: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Return rows of equal arrays as one array of each name, with a leading axis of the rows."""
+    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from egosim_jax.data.records import stacked
+from egosim_jax.io.untrusted.npz import read_all
 from egosim_jax.train.online.plan import OnlineTraining
 from egosim_jax.train.online.pool import CHUNK
 from egosim_jax.train.online.scenes import HELD_OUT, queued
@@ -31,8 +33,7 @@ class Clips(threading.Thread):
         rows: list[Mapping[str, np.ndarray]] = []
         while self.folder.is_dir():
             for path in queued(self.folder):
-                with np.load(path) as file:
-                    row = dict(file)
+                row = read_all(path)  # NumPy's own reader fails in threads of Python 3.11
                 path.unlink()
                 if path.name.startswith(HELD_OUT):
                     self.held.append(row)
@@ -42,11 +43,6 @@ class Clips(threading.Thread):
                     self.chunks.put(stacked(rows))
                     rows = []
             time.sleep(0.1)
-
-
-def stacked(rows: list[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Return rows as one array each."""
-    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 
 
 def start_workers(plan: OnlineTraining, folder: Path) -> list[subprocess.Popen]:

@@ -21,7 +21,9 @@ from flax import nnx
 
 from egosim_jax import configs
 from egosim_jax.configs.model import ModelConfig
+from egosim_jax.data.records import stacked
 from egosim_jax.io.atomic import atomic_write
+from egosim_jax.io.untrusted.npz import array_names, read_arrays
 from egosim_jax.train.online.pool import CHUNK, latent_shapes, make_encode
 from egosim_jax.train.online.scenes import EndlessScenes, row_of
 
@@ -49,8 +51,7 @@ def write_shard(path: Path, rows: Mapping[str, np.ndarray]) -> None:
 
 def read_shard(path: Path, model: ModelConfig) -> dict[str, np.ndarray]:
     """Return the rows of a shard, in the dtypes of `pool.latent_shapes`."""
-    with np.load(path) as file:
-        arrays = dict(file)
+    arrays = read_arrays(path, {}, others=array_names(path), packed=True)
     rows = {}
     for name, shape in latent_shapes(model, len(arrays["ids"])).items():
         array = arrays[name]
@@ -94,7 +95,7 @@ def make_latents(
         raw += [row_of(triplet, model) for triplet in source.triplets(seed)]
         while len(raw) >= CHUNK:
             batch, raw = raw[:CHUNK], raw[CHUNK:]
-            rows = encode({name: np.stack([row[name] for row in batch]) for name in batch[0]})
+            rows = encode(stacked(batch))
             encoded.append({name: np.asarray(array) for name, array in rows.items()})
         if len(encoded) * CHUNK >= SHARD:
             rows = {n: np.concatenate([part[n] for part in encoded]) for n in encoded[0]}

@@ -23,10 +23,11 @@ import numpy as np
 from flax import nnx
 
 from egosim_jax.configs.model import Networks
+from egosim_jax.data.records import stacked
 from egosim_jax.io import parts, weights
 from egosim_jax.train.deepen import deepen_weights
 from egosim_jax.train.metric_writers import JsonLines
-from egosim_jax.train.online.arrivals import Clips, stacked, start_workers
+from egosim_jax.train.online.arrivals import Clips, start_workers
 from egosim_jax.train.online.latents import read_latents
 from egosim_jax.train.online.plan import OnlineTraining
 from egosim_jax.train.online.pool import (

@@ -59,7 +59,14 @@ class Updater:
     @property
     def optimizer(self) -> optax.GradientTransformation:
         """Muon at rate 1."""
-        return make_optimizer(OptimizerConfig(name="muon", weight_decay=self.weight_decay))
+        return make_optimizer(self.config)
+
+    @property
+    def config(self) -> OptimizerConfig:
+        """Hyper-parameters; the learning rate is an argument of the update."""
+        return OptimizerConfig(
+            name="muon", weight_decay=self.weight_decay, ema_decay=self.ema_decay
+        )
 
     def create(self, params: nnx.State) -> OnlineState:
         """Return the state before the first update."""
@@ -82,8 +89,8 @@ class Updater:
         valid = jnp.isfinite(value) & jnp.isfinite(optax.tree.norm(gradients))
         updates, opt_state = self.optimizer.update(gradients, state.opt_state, state.params)
         params: Any = optax.apply_updates(state.params, jax.tree.map(lambda x: rate * x, updates))
-        # At first the average follows faster, so that it does not keep the start.
-        decay = jnp.minimum(self.ema_decay, (1 + state.step) / (10 + state.step))
+        # By the clock a run may end at any step, so the average is warmed up.
+        decay = self.config.ema_decay_at(state.step, steps=1)
         average: Any = optax.incremental_update(params, state.average, 1 - decay)
         changed = OnlineState(
             step=state.step + 1,

@@ -86,11 +86,8 @@ class Refining(Autoencoding):
     ) -> tuple[jax.Array, Metrics]:
         """Return the loss of the module docstring, for sampled latents."""
         draw = jax.random.fold_in(keys[0], 1)
-        frames = jax.random.choice(
-            draw, self.video.frames, (self.perceptual_frames,), replace=False
-        )
         _, loss, metrics = self.refinement_loss(
-            networks.vae, to_model(batch["video"]), keys[0], frames
+            networks.vae, to_model(batch["video"]), keys[0], self._draw_frames(draw)
         )
         return loss, metrics
 
@@ -111,10 +108,7 @@ class Refining(Autoencoding):
     ) -> tuple[Float[Array, "b f h w 3"], jax.Array, Metrics]:
         """Return the output of `reconstruct`; the loss also has LPIPS of the given frames."""
         decoded, loss, metrics = self.reconstruct(vae, video, key)
-        if self.perceptual_weight:
-            metrics["lpips"] = lpips(decoded[:, frames], video[:, frames]).mean()
-            loss = loss + self.perceptual_weight * metrics["lpips"]
-        return decoded, loss, metrics
+        return decoded, *self._with_lpips(loss, metrics, decoded, video, frames)
 
     def decoding_loss(
         self,
@@ -129,13 +123,26 @@ class Refining(Autoencoding):
         """
         decoded = vae.decode_whole(vae.denormalize(latents))
         loss, metrics = self.compare(decoded, video)
-        if self.perceptual_weight:
-            frames = jax.random.choice(
-                key, self.video.frames, (self.perceptual_frames,), replace=False
-            )
-            metrics["lpips"] = lpips(decoded[:, frames], video[:, frames]).mean()
-            loss = loss + self.perceptual_weight * metrics["lpips"]
-        return loss, metrics
+        return self._with_lpips(loss, metrics, decoded, video, self._draw_frames(key))
+
+    def _draw_frames(self, key: Key[Array, ""]) -> Int[Array, " n"]:
+        """Return random frames that the perceptual term compares."""
+        count = self.perceptual_frames
+        return jax.random.choice(key, self.video.frames, (count,), replace=False)
+
+    def _with_lpips(
+        self,
+        loss: jax.Array,
+        metrics: Metrics,
+        decoded: Float[Array, "b f h w 3"],
+        video: Float[Array, "b f h w 3"],
+        frames: Int[Array, " n"],
+    ) -> tuple[jax.Array, Metrics]:
+        """Return loss and metrics with the perceptual term of some frames."""
+        if not self.perceptual_weight:
+            return loss, metrics
+        distance = lpips(decoded[:, frames], video[:, frames]).mean()
+        return loss + self.perceptual_weight * distance, {**metrics, "lpips": distance}
 
     def validate(self, networks: Networks, batch: Batch) -> Metrics:
         """Return PSNR and LPIPS of each clip, reconstructed from the mean latents."""
