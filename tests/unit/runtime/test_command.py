@@ -115,7 +115,7 @@ def test_the_preflights_search_is_announced_and_can_be_skipped(monkeypatch, caps
     searched = []
     monkeypatch.setattr(preflight, "_others", lambda *args: searched.append(args) or {})
     monkeypatch.setattr(preflight, "compile_step", lambda *stage: SimpleNamespace(fits=True))
-    for name in ("text", "plain", "_heading"):
+    for name in ("text", "plain", "_heading", "_host_memory"):
         monkeypatch.setattr(preflight, name, lambda *report: "")
     monkeypatch.setattr(preflight.math, "isnan", lambda value: False)
     options = ["debug", "--preflight", "cpu:1"]
