@@ -6,16 +6,19 @@ satisfy the Protocols of this module.
 
     Denoiser, VideoCodec, TextEncoder, ImageEncoder   networks
     DenoiserConfig, VideoCodecConfig, ...             their configs
+    CausalDenoiser, Chunks                            denoiser of one chunk of a clip at a time
     wan, cogvideox                                    model families
     lora                                              low-rank adaptation
 """
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
 
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
+
+from egosim_jax.models.chunks import Chunks
 
 
 @runtime_checkable
@@ -41,6 +44,59 @@ class Denoiser(Protocol):
 
         `Process.timesteps` returns them.
         """
+        ...
+
+
+@runtime_checkable
+class CausalDenoiser(Denoiser, Protocol):
+    """Denoiser that can also make a clip chunk by chunk, from the chunks before."""
+
+    def share(self, text: Float[Array, "b n d"], image: Float[Array, "b m e"] | None = None) -> Any:
+        """Compute what the chunks of a clip share."""
+        ...
+
+    def prepare_chunk(
+        self, condition: Float[Array, "b f h w c"], shared: Any, first_frame: int
+    ) -> Any:
+        """Compute the context that all denoising steps of a chunk share.
+
+        The chunk begins at the latent frame `first_frame` of the clip.
+        """
+        ...
+
+    def empty_cache(self, batch: int, latents: tuple[int, int, int]) -> Cache:
+        """Return the cache with which the first chunk of clips of a size is denoised."""
+        ...
+
+    def denoise_chunk(
+        self, noisy: Float[Array, "b f h w c"], t: Float[Array, " b"], context: Any, cache: Any
+    ) -> tuple[Float[Array, "b f h w c"], Any]:
+        """Return the prediction for the next chunk, and what later chunks need of it.
+
+        Raises `InputError` for a cache that does not end where the chunk begins.
+        """
+        ...
+
+    def denoise_packed(
+        self,
+        clean: Float[Array, "b f h w c"],
+        noisy: Float[Array, "b f h w c"],
+        t: Float[Array, "b k"],
+        context: Any,
+        chunks: Chunks,
+    ) -> Float[Array, "b f h w c"]:
+        """Return the prediction for all chunks, each from the clean chunks before it.
+
+        Each chunk has its own timestep. `prepare` returns the context.
+        """
+        ...
+
+
+class Cache(Protocol):
+    """Memory of a causal denoiser, of the finished chunks of a clip; a pytree."""
+
+    def put(self, chunk: Any) -> Self:
+        """Return the cache with one more chunk, by the second result of `denoise_chunk`."""
         ...
 
 
@@ -144,6 +200,23 @@ class DenoiserConfig(NetworkConfig, Protocol):
 
     def forward_flops(self, *, latents: tuple[int, int, int], text: int, image: int) -> Flops:
         """Return the FLOPs of a forward pass of one sample, by its latent cells and tokens."""
+        ...
+
+
+@runtime_checkable
+class CausalDenoiserConfig(Protocol):
+    """Config of a denoiser that is a `CausalDenoiser`, in addition to `DenoiserConfig`."""
+
+    def packed_flops(
+        self, *, latents: tuple[int, int, int], chunks: Chunks, text: int, image: int
+    ) -> Flops:
+        """Return the FLOPs of a forward pass of all chunks of one sample (`denoise_packed`)."""
+        ...
+
+    def chunk_flops(
+        self, *, latents: tuple[int, int, int], seen: int, text: int, image: int
+    ) -> Flops:
+        """Return the FLOPs of a step of one chunk (`denoise_chunk`), after `seen` latent frames."""
         ...
 
 

@@ -10,8 +10,9 @@ of s, p = exp(s - l) gives, for the cotangent g of out,
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +32,7 @@ from egosim_jax.sharding import (
 )
 from egosim_jax.types import InputError
 
+T = TypeVar("T")
 Kernel = Literal["auto", "xla", "cudnn", "hopper", "splash"]
 """Attention kernel.
 
@@ -71,23 +73,16 @@ def attention(
     if there are few keys. Each device then runs the kernel by itself.
     """
     if over is not None and several_devices():
-        _check_parts(q.shape, over)
-        queries = {
-            "heads": spec("batch", None, "heads", None),
-            "queries": spec("batch", "tokens", None, None),
-        }[over]
-        keys = queries if over == "heads" else spec("batch", None, None, None)
-        shared = jax.shard_map(
-            partial(attention, scale=scale, kernel=kernel),
-            in_specs=(queries, keys, keys),
-            out_specs=queries,
-            check_vma=False,
-        )
-        # Without this, the compiler would also split the weights of q, k and v by heads.
-        tokens = partial(constrain, axes=("batch", "tokens", None, None))
+        local = partial(attention, scale=scale, kernel=kernel)
         if over == "heads":
-            k, v = tokens(k), tokens(v)
-        return tokens(shared(tokens(q), k, v))
+            return split_tokens(by_heads(local, q, k, v))
+        _check_parts(q.shape, over)
+        queries = spec("batch", "tokens", None, None)
+        keys = spec("batch", None, None, None)
+        shared = jax.shard_map(
+            local, in_specs=(queries, keys, keys), out_specs=queries, check_vma=False
+        )
+        return split_tokens(shared(split_tokens(q), k, v))
     if bias is not None:
         return jax.nn.dot_product_attention(q, k, v, bias=bias, scale=scale, implementation="xla")
     scale = float(q.shape[-1] ** -0.5) if scale is None else scale
@@ -99,10 +94,37 @@ def attention(
     if kernel == "cudnn":
         return flash.cudnn(q, k, v, scale=scale)
     if kernel == "splash":
-        name = SELF_ATTENTION if q.shape == k.shape else None
+        name = SELF_ATTENTION if q.size <= k.size else None
         return flash.splash(q, k, v, scale=scale, name=name, interpret=platform() != "tpu")
     heads = (rearrange(x, "b n h k -> h b n k") for x in (q, k, v))
     return rearrange(_by_head(*heads, scale), "h b n k -> b n h k")
+
+
+def by_heads(
+    attend: Callable[..., T],
+    q: Float[Array, "b n h k"],
+    k: Float[Array, "b n h k"],
+    v: Float[Array, "b n h k"],
+    *others: Float[Array, "b m h k"],
+) -> T:
+    """Return `attend(q, k, v, *others)`; each device along context computes a part of the heads.
+
+    The devices exchange the tokens of q, k and v for heads. The other arrays and the results,
+    `b m h k`, are split by heads.
+    """
+    if not several_devices():
+        return attend(q, k, v, *others)
+    _check_parts(q.shape, "heads")
+    heads = spec("batch", None, "heads", None)
+    shared = jax.shard_map(attend, in_specs=heads, out_specs=heads, check_vma=False)
+    # Without this, the compiler would also split the weights of q, k and v by heads.
+    k, v = split_tokens(k), split_tokens(v)
+    return shared(split_tokens(q), k, v, *others)
+
+
+def split_tokens(x: Float[Array, "b n h k"]) -> Float[Array, "b n h k"]:
+    """Constrain the devices along context to split the tokens of heads."""
+    return constrain(x, ("batch", "tokens", None, None))
 
 
 def _best(q: jax.Array) -> Kernel:
@@ -143,7 +165,7 @@ def _forward(q: jax.Array, k: jax.Array, v: jax.Array, scale: float) -> tuple[ja
         return out.astype(v.dtype), top + jnp.log(total)
 
     out, log_total = jax.lax.map(head, (q, k, v), batch_size=_heads_at_once(q, k))
-    if q.shape == k.shape:
+    if q.size <= k.size:
         out, log_total = (checkpoint_name(x, SELF_ATTENTION) for x in (out, log_total))
     return out, (q, k, v, out, log_total)
 
@@ -184,9 +206,9 @@ def keep_attention(primitive: Any, *operands: Any, **parameters: Any) -> bool:
     """Return whether a checkpointed block keeps a value: only the output of self-attention.
 
     This is a policy of `jax.checkpoint`. The kernels' backward passes need the output and the
-    log-sum-exp; keeping both spares a second forward pass of the kernel. Cross-attention, which
-    has few keys, is recomputed.
+    log-sum-exp; keeping both spares a second forward pass of the kernel. Self-attention has at
+    least as many keys as queries. Cross-attention, which has few keys, is recomputed.
     """
     if primitive.name == CUDNN_FORWARD:
-        return operands[0].shape == operands[1].shape
+        return operands[0].size <= operands[1].size
     return primitive.name == "name" and parameters["name"] == SELF_ATTENTION

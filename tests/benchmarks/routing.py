@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int, Key
 from egosim_jax.configs.model import Networks
 from egosim_jax.models import remat
 from egosim_jax.models.layers import scan_blocks
+from egosim_jax.models.wan.causal import whole
 from egosim_jax.models.wan.dit import DiTContext, WanDiT
 from egosim_jax.models.wan.layers import PATCH
 from egosim_jax.train.tasks.denoising import Denoising, condition_of, loss_weights
@@ -66,7 +67,7 @@ class Routing(Denoising):
         routed: Int[Array, " k"],
     ) -> Float[Array, "b f h w c"]:
         """Return what `WanDiT.denoise` does, by parts of its blocks."""
-        time, modulation = dit.time(t)
+        time, modulation = dit.time(t[:, None])
         x = dit.patch.noisy(noisy) + context.patches
         last = dit.config.layers - self.behind
         x = _through(dit, x, modulation, context, slice(0, self.before))
@@ -88,7 +89,7 @@ class Routing(Denoising):
 def _through(
     dit: WanDiT,
     x: Float[Array, "b n d"],
-    modulation: Float[Array, "b 6 d"],
+    modulation: Float[Array, "b g 6 d"],
     context: DiTContext,
     layers: slice,
 ) -> Float[Array, "b n d"]:
@@ -97,8 +98,10 @@ def _through(
     part = nnx.merge(graph, jax.tree.map(lambda leaf: leaf[layers], state))
     sources = jax.tree.map(lambda leaf: leaf[layers], context.sources)
 
+    attend = whole(dit.config.attention)
+
     def step(block: Any, x: jax.Array, sources: Any) -> tuple[jax.Array, None]:
-        return block(x, modulation, context.rotation, sources), None
+        return block(x, modulation, context.rotation, sources, attend)
 
     x, _ = scan_blocks(step, part, x, sources, remat=remat.wrapper(dit.config.remat))
     return x

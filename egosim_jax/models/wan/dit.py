@@ -7,13 +7,18 @@ blocks of `layers` and become the velocity of the noisy latents.
 Everything that does not depend on the step is computed once by `prepare`: the patch embedding is
 linear, so the condition's contribution is separate; keys and values of the cross-attentions depend
 on text and image only. A solver calls `denoise` at each step.
+
+A causal student has the same weights, and makes a clip chunk by chunk (`causal`): `share` computes
+what the chunks share, `prepare_chunk` the context of one chunk, and `denoise_chunk` is a step of
+it. Training denoises all chunks at once, by `denoise_packed`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from math import prod
-from typing import ClassVar, no_type_check
+from typing import Any, ClassVar, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -22,11 +27,14 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from egosim_jax.models import Flops, remat, rope
+from egosim_jax.models.chunks import Chunks
 from egosim_jax.models.layers import scan_blocks, stack
 from egosim_jax.models.patch import PatchEmbedding, check_condition
+from egosim_jax.models.wan.causal import CACHE, KeyValueCache, by_run, cached, packed, whole
 from egosim_jax.models.wan.layers import (
     MLP,
     PATCH,
+    Attend,
     Block,
     CrossAttention,
     Head,
@@ -74,19 +82,66 @@ class WanDiTConfig(WanDiTSizes):
 
         and the embeddings and the head. Norms and activations do not count.
         """
-        d, f, depth = self.dim, self.ffn_dim, self.layers
         n = prod(latents) // PATCH**2
-        image = image if self.image_dim is not None else 0
-        block = 12 * n * d**2 + 4 * (text + image) * d**2 + 4 * n * d * f
-        embeddings = 2 * n * PATCH**2 * (self.in_channels + self.out_channels) * d
-        embeddings += 2 * text * (self.text_dim * d + d**2)
-        embeddings += 2 * (self.freq_dim * d + 7 * d**2)
-        if self.image_dim is not None:
-            embeddings += 2 * image * (self.image_dim**2 + self.image_dim * d)
-        return Flops(
-            weights=float(depth * block + embeddings),
-            attention=float(depth * 4 * n * (n + text + image) * d),
+        return self._flops(n, pairs=n * n, text=text, image=image, conditioned=n)
+
+    def packed_flops(
+        self, *, latents: tuple[int, int, int], chunks: Chunks, text: int, image: int
+    ) -> Flops:
+        """Return the FLOPs of a forward pass of all chunks of one sample (`denoise_packed`).
+
+        The formulas of `forward_flops` hold with N clean and noisy tokens, and with the number of
+        pairs of a query and a key in place of N^2.
+        """
+        tokens = prod(latents[1:]) // PATCH**2
+        clean = chunks.bounds[-2]
+        ends = zip(chunks.sizes, chunks.bounds[1:], strict=True)
+        seen = [size * end for size, end in ends]
+        return self._flops(
+            (clean + latents[0]) * tokens,
+            pairs=(sum(seen) + sum(seen[:-1])) * tokens**2,
+            text=text,
+            image=image,
+            conditioned=latents[0] * tokens,
+            times=1 + len(seen) if clean else 1,
         )
+
+    def chunk_flops(
+        self, *, latents: tuple[int, int, int], seen: int, text: int, image: int
+    ) -> Flops:
+        """Return the FLOPs of a step of one chunk (`denoise_chunk`), after `seen` latent frames.
+
+        Keys and values of text and image, and the condition's patches, are given.
+        """
+        tokens = prod(latents[1:]) // PATCH**2
+        n = latents[0] * tokens
+        pairs = n * (n + seen * tokens)
+        return self._flops(n, pairs=pairs, text=text, image=image, is_shared=True)
+
+    def _flops(
+        self,
+        n: int,
+        *,
+        pairs: int,
+        text: int,
+        image: int,
+        conditioned: int = 0,
+        times: int = 1,
+        is_shared: bool = False,
+    ) -> Flops:
+        """Return the FLOPs of n tokens; `conditioned` is the number that embed the condition."""
+        d, f, depth = self.dim, self.ffn_dim, self.layers
+        image = image if self.image_dim is not None else 0
+        weights = depth * (12 * n * d**2 + 4 * n * d * f)
+        noisy, condition = 2 * self.out_channels, self.in_channels - self.out_channels
+        weights += 2 * PATCH**2 * (n * noisy + conditioned * condition) * d
+        weights += 2 * times * (self.freq_dim * d + 7 * d**2)
+        if not is_shared:
+            weights += depth * 4 * (text + image) * d**2 + 2 * text * (self.text_dim * d + d**2)
+            if self.image_dim is not None:
+                weights += 2 * image * (self.image_dim**2 + self.image_dim * d)
+        attention = depth * 4 * (pairs + n * (text + image)) * d
+        return Flops(weights=float(weights), attention=float(attention))
 
     @property
     def patch(self) -> tuple[int, int, int]:
@@ -106,6 +161,8 @@ class DiTContext:
     """Cross-attention keys and values of all layers: of the text, then of the image if any."""
     rotation: Float[Array, "n k 2"]
     """Rotary embedding table of the tokens."""
+    first_frame: int = field(default=0, metadata={"static": True})
+    """Latent frame of the clip at which the tokens begin."""
 
 
 class WanDiT(nnx.Module):
@@ -140,8 +197,14 @@ class WanDiT(nnx.Module):
         `condition` holds the channels after the noisy ones (none for text to video), `text` the
         text encoder's tokens, `image` the image encoder's, for models with the image branch.
         """
-        self._check(condition.shape, has_image=image is not None)
-        _, f, h, w, _ = condition.shape
+        self._check(condition.shape)
+        return self.prepare_chunk(condition, self.share(text, image), 0)
+
+    def share(
+        self, text: Float[Array, "b n e"], image: Float[Array, "b m i"] | None = None
+    ) -> tuple[KeysValues, ...]:
+        """Compute the keys and values of text and image, which the chunks of a clip share."""
+        self._check_image(has_image=image is not None)
         tokens = [self.text(text)]
         if self.image is not None and image is not None:
             tokens.append(self.image(image))
@@ -153,36 +216,128 @@ class WanDiT(nnx.Module):
         _, sources = scan_blocks(
             step, self.blocks.cross_attn, None, remat=remat.wrapper(self.config.remat)
         )
+        return sources
+
+    def prepare_chunk(
+        self,
+        condition: Float[Array, "b f h w c"],
+        shared: tuple[KeysValues, ...],
+        first_frame: int,
+    ) -> DiTContext:
+        """Compute the context that all denoising steps of a chunk share, by its condition."""
+        self._check(condition.shape)
+        _, f, h, w, _ = condition.shape
+        sizes = h // PATCH, w // PATCH, self.config.head_dim
+        before = first_frame * sizes[0] * sizes[1]
         return DiTContext(
             patches=self.patch.condition(condition),
-            sources=sources,
-            rotation=rope.rotations(f, h // PATCH, w // PATCH, self.config.head_dim),
+            sources=shared,
+            rotation=rope.rotations(first_frame + f, *sizes)[before:],
+            first_frame=first_frame,
         )
 
     def denoise(
         self, noisy: Float[Array, "b f h w c"], t: Float[Array, " b"], context: DiTContext
     ) -> Float[Array, "b f h w c"]:
         """Return the velocity, in float32, of noisy latents at timesteps in [0, 1000]."""
-        _, _, h, w, _ = noisy.shape
-        time, modulation = (constrain(x, VECTORS) for x in self.time(t))
+        x = self.patch.noisy(noisy) + context.patches
+        attend = whole(self.config.attention)
+        tokens, _ = self._through(x, t[:, None], context, lambda past: attend)
+        return _unpatched(tokens, noisy.shape)
 
-        def step(block: Block, x: jax.Array, sources: tuple[KeysValues, ...]) -> tuple:
+    def denoise_packed(
+        self,
+        clean: Float[Array, "b f h w c"],
+        noisy: Float[Array, "b f h w c"],
+        t: Float[Array, "b c"],
+        context: DiTContext,
+        chunks: Chunks,
+    ) -> Float[Array, "b f h w c"]:
+        """Return the velocity of noisy latents, each chunk's from the clean chunks before it.
+
+        Each chunk has its own timestep. `context` is the context of the clip.
+        """
+        chunks.check(noisy.shape[1])
+        seen = chunks.bounds[-2]
+        tokens = context.patches.shape[1] // noisy.shape[1]
+        both = jnp.concatenate([clean[:, :seen], noisy], axis=1)
+        before = slice(seen * tokens)
+        patches = jnp.concatenate([context.patches[:, before], context.patches], axis=1)
+        rotation = jnp.concatenate([context.rotation[before], context.rotation])
+        lengths = [size * tokens for size in (seen, *chunks.sizes) if size]
+        if seen:
+            t = jnp.concatenate([jnp.zeros_like(t[:, :1]), t], axis=1)
+        attend = packed([bound * tokens for bound in chunks.bounds], self.config.attention)
+        x, _ = self._through(
+            self.patch.noisy(both) + patches,
+            t,
+            replace(context, rotation=rotation),
+            lambda past: attend,
+            lengths=lengths,
+        )
+        return _unpatched(x, both.shape)[:, seen:]
+
+    def empty_cache(self, batch: int, latents: tuple[int, int, int]) -> KeyValueCache:
+        """Return room for the self-attention keys and values of clips of a size."""
+        config = self.config
+        tokens = prod(latents) // PATCH**2
+        shape = config.layers, batch, tokens, config.heads, config.head_dim
+        keys, values = (constrain(jnp.zeros(shape, config.attention_dtype), CACHE) for _ in "kv")
+        return KeyValueCache(keys=keys, values=values, latents=latents)
+
+    def denoise_chunk(
+        self,
+        noisy: Float[Array, "b f h w c"],
+        t: Float[Array, " b"],
+        context: DiTContext,
+        cache: KeyValueCache,
+    ) -> tuple[Float[Array, "b f h w c"], KeysValues]:
+        """Return the velocity of the next chunk of a clip, and the chunk's keys and values.
+
+        The cache has the keys and values of the chunks before it.
+        """
+        cache.check(noisy.shape, context.first_frame)
+        start = context.first_frame * context.patches.shape[1] // noisy.shape[1]
+        x, kept = self._through(
+            self.patch.noisy(noisy) + context.patches,
+            t[:, None],
+            context,
+            lambda past: cached(past, start, self.config.attention),
+            past=(cache.keys, cache.values) if start else None,
+        )
+        return _unpatched(x, noisy.shape), kept
+
+    def _through(
+        self,
+        x: Float[Array, "b n d"],
+        t: Float[Array, "b g"],
+        context: DiTContext,
+        attention: Callable[[KeysValues | None], Attend],
+        *,
+        lengths: Sequence[int] = (0,),
+        past: KeysValues | None = None,
+    ) -> tuple[Float[Array, "b n o"], Any]:
+        """Pass tokens through blocks and head; also return what `attention` keeps of the layers.
+
+        `t` are the timesteps of runs of tokens of these lengths.
+        """
+        time, modulation = (by_run(vectors, lengths) for vectors in self.time(t))
+        time, modulation = constrain(time, VECTORS), constrain(modulation, (*VECTORS, None))
+
+        def step(block: Block, x: jax.Array, given: tuple) -> tuple:
+            sources, past = given
             x = remat.name_input(x)
-            x = block(x, modulation, context.rotation, sources)
-            return constrain(x, TOKENS), None
+            x, kept = block(x, modulation, context.rotation, sources, attention(past))
+            return constrain(x, TOKENS), kept
 
-        x = constrain(self.patch.noisy(noisy) + context.patches, TOKENS)
-        x, _ = scan_blocks(
-            step, self.blocks, x, context.sources, remat=remat.wrapper(self.config.remat)
+        x, kept = scan_blocks(
+            step,
+            self.blocks,
+            constrain(x, TOKENS),
+            (context.sources, past),
+            remat=remat.wrapper(self.config.remat),
         )
-        return rearrange(
-            self.head(x, time),
-            "b (f h w) (i j c) -> b f (h i) (w j) c",
-            h=h // PATCH,
-            w=w // PATCH,
-            i=PATCH,
-            j=PATCH,
-        )
+        return self.head(x, time), kept
 
     def __call__(
         self,
@@ -195,16 +350,31 @@ class WanDiT(nnx.Module):
         noisy, condition = jnp.split(latents, [self.config.out_channels], axis=-1)
         return self.denoise(noisy, t, self.prepare(condition, text, image))
 
-    def _check(self, condition: tuple[int, ...], *, has_image: bool) -> None:
-        config = self.config
+    def _check(self, condition: tuple[int, ...]) -> None:
         check_condition(
             condition,
-            in_channels=config.in_channels,
-            noisy_channels=config.out_channels,
+            in_channels=self.config.in_channels,
+            noisy_channels=self.config.out_channels,
             patch=PATCH,
         )
+
+    def _check_image(self, *, has_image: bool) -> None:
+        config = self.config
         if has_image != (config.image_dim is not None):
             given, fix = ("were", "Omit them") if has_image else ("were not", "Pass them")
             raise InputError(
                 f"Image tokens {given} given to a model with image_dim {config.image_dim}. {fix}."
             )
+
+
+def _unpatched(x: Float[Array, "b n o"], shape: tuple[int, ...]) -> Float[Array, "b f h w c"]:
+    """Return the velocity's patches as latents of this shape."""
+    _, _, h, w, _ = shape
+    return rearrange(
+        x,
+        "b (f h w) (i j c) -> b f (h i) (w j) c",
+        h=h // PATCH,
+        w=w // PATCH,
+        i=PATCH,
+        j=PATCH,
+    )

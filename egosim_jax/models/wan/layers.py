@@ -19,11 +19,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial, reduce
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-from einops import rearrange
+from einops import rearrange, repeat
 from flax import nnx
 from jaxtyping import Array, Float
 
@@ -50,6 +50,8 @@ IMAGE_NORM_EPS = 1e-5
 
 Activation = Callable[[jax.Array], jax.Array]
 KeysValues = tuple[Float[Array, "*l b _ h k"], Float[Array, "*l b _ h k"]]
+Attend = Callable[[jax.Array, jax.Array, jax.Array], tuple[Float[Array, "b n h k"], Any]]
+"""Self-attention of queries, keys and values by head: the result, and what to keep of the layer."""
 
 xavier = nnx.initializers.xavier_uniform()
 normal = nnx.initializers.normal(0.02)
@@ -179,12 +181,15 @@ class TimeEmbedding(nnx.Module):
         self.modulation = linear(config, (config.dim, 6 * config.dim), ("embed", None), rngs)
 
     def __call__(
-        self, t: Float[Array, " b"]
-    ) -> tuple[Float[Array, "b 1 d"], Float[Array, "b 6 d"]]:
+        self, t: Float[Array, "b g"]
+    ) -> tuple[Float[Array, "b g d"], Float[Array, "b g 6 d"]]:
         """Embed timesteps in [0, 1000]."""
-        vector = self.mlp(time_sinusoid(t, self.freq_dim))
-        modulation = rearrange(self.modulation(jax.nn.silu(vector)), "b (k d) -> b k d", k=6)
-        return vector[:, None].astype(jnp.float32), modulation.astype(jnp.float32)
+        vector = self.mlp(time_sinusoid(t.reshape(-1), self.freq_dim))
+        modulation = self.modulation(jax.nn.silu(vector)).astype(jnp.float32)
+        return (
+            rearrange(vector, "(b g) d -> b g d", b=len(t)).astype(jnp.float32),
+            rearrange(modulation, "(b g) (k d) -> b g k d", b=len(t), k=6),
+        )
 
 
 class ImageEmbedding(nnx.Module):
@@ -241,28 +246,21 @@ class Attention(KeyValue):
         """Return the normalized queries, in float32."""
         return self._by_head(self.norm_q(name_projection(self.q(x))))
 
-    def attend(
-        self,
-        q: Float[Array, "b n h k"],
-        k: Float[Array, "b m h k"],
-        v: Float[Array, "b m h k"],
-        over: Literal["heads", "queries"],
-    ) -> Float[Array, "b n d"]:
-        """Attend in the dtype of the attention's products and join the heads."""
-        q, k = q.astype(self.dtype), k.astype(self.dtype)
-        out = attention(q, k, v, kernel=self.kernel, over=over)
-        return rearrange(out, "b n h k -> b n (h k)")
+    def output(self, heads: Float[Array, "b n h k"]) -> Float[Array, "b n d"]:
+        """Join the heads and project them."""
+        return name_projection(self.o(rearrange(heads, "b n h k -> b n (h k)")))
 
 
 class SelfAttention(Attention):
     """Self-attention of the video's tokens, with rotary positions."""
 
     def __call__(
-        self, x: Float[Array, "b n d"], rotation: Float[Array, "n k 2"]
-    ) -> Float[Array, "b n d"]:
-        """Attend from all tokens to all tokens, with rotated queries and keys."""
+        self, x: Float[Array, "b n d"], rotation: Float[Array, "n k 2"], attend: Attend
+    ) -> tuple[Float[Array, "b n d"], Any]:
+        """Attend by `attend`, with rotated queries and keys."""
         q, k = (rope.rotate(heads, rotation) for heads in (self.queries(x), self.keys(x)))
-        return name_projection(self.o(self.attend(q, k, self.values(x), "heads")))
+        out, kept = attend(q.astype(self.dtype), k.astype(self.dtype), self.values(x))
+        return self.output(out), kept
 
 
 class CrossAttention(Attention):
@@ -281,13 +279,16 @@ class CrossAttention(Attention):
         self, x: Float[Array, "b n d"], sources: tuple[KeysValues, ...]
     ) -> Float[Array, "b n d"]:
         """Attend to each source separately and add the results."""
-        q = self.queries(x)
-        attended = (self.attend(q, *keys_values, "queries") for keys_values in sources)
-        return name_projection(self.o(reduce(jnp.add, attended)))
+        q = self.queries(x).astype(self.dtype)
+        attend = partial(attention, q, kernel=self.kernel, over="queries")
+        return self.output(reduce(jnp.add, (attend(k, v) for k, v in sources)))
 
 
 class Block(nnx.Module):
-    """Transformer block: self-attention, cross-attention and MLP on the residual stream."""
+    """Transformer block: self-attention, cross-attention and MLP on the residual stream.
+
+    The tokens are g equal runs. All tokens of a run have the same timestep.
+    """
 
     def __init__(self, config: WanDiTSizes, *, rngs: nnx.Rngs):
         sizes = (config.dim, config.ffn_dim, config.dim)
@@ -301,18 +302,33 @@ class Block(nnx.Module):
     def __call__(
         self,
         x: Float[Array, "b n d"],
-        modulation: Float[Array, "b 6 d"],
+        modulation: Float[Array, "b g 6 d"],
         rotation: Float[Array, "n k 2"],
         sources: tuple[KeysValues, ...],
-    ) -> Float[Array, "b n d"]:
-        """Update the residual stream; sums are taken in float32 and kept in x's dtype."""
+        attend: Attend,
+    ) -> tuple[Float[Array, "b n d"], Any]:
+        """Update the residual stream; sums are taken in float32 and kept in x's dtype.
+
+        Also returns the second result of `attend`.
+        """
         shifts = self.modulation[...].astype(jnp.float32) + modulation
-        shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = rearrange(shifts, "b k d -> k b 1 d")
-        attended = self.self_attn(modulate(self.norm(x), shift_a, scale_a), rotation)
+        shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = by_token(shifts, x.shape[1])
+        attended, kept = self.self_attn(modulate(self.norm(x), shift_a, scale_a), rotation, attend)
         x = (x + gate_a * attended).astype(x.dtype)
         x = x + self.cross_attn(self.cross_norm(x), sources)
         mapped = self.mlp(modulate(self.norm(x), shift_m, scale_m))
-        return (x + gate_m * mapped).astype(x.dtype)
+        return (x + gate_m * mapped).astype(x.dtype), kept
+
+
+def by_token(
+    vectors: Float[Array, "b g k d"], tokens: int
+) -> Float[Array, "k b 1 d"] | list[Float[Array, "b n d"]]:
+    """Return k vectors of each token, by g equal runs of tokens; one run has them once."""
+    groups = vectors.shape[1]
+    if groups == 1:
+        return rearrange(vectors, "b 1 k d -> k b 1 d")
+    each = rearrange(vectors, "b g k d -> k b g d")
+    return [repeat(vector, "b g d -> b (g n) d", n=tokens // groups) for vector in each]
 
 
 class Head(nnx.Module):
@@ -325,9 +341,9 @@ class Head(nnx.Module):
         self.linear = linear(config, sizes, ("embed", None), rngs, zeros)
 
     def __call__(
-        self, x: Float[Array, "b n d"], time: Float[Array, "b 1 d"]
+        self, x: Float[Array, "b n d"], time: Float[Array, "b g d"]
     ) -> Float[Array, "b n o"]:
         """Project; zero at initialization."""
-        shifts = self.modulation[...].astype(jnp.float32) + time
-        shift, scale = rearrange(shifts, "b k d -> k b 1 d")
+        shifts = self.modulation[...].astype(jnp.float32) + time[:, :, None]
+        shift, scale = by_token(shifts, x.shape[1])
         return self.linear(modulate(self.norm(x), shift, scale)).astype(jnp.float32)
