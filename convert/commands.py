@@ -121,6 +121,7 @@ class Weights:
     def run(self, *, keep_logs: bool = False) -> int:
         """Detect, check and write the networks; with `keep_logs`, only incomplete ones."""
         from egosim_jax import configs
+        from egosim_jax.configs.model import metadata_of
 
         config = configs.get(self.config)
         folder = detect(self.source, config).only(self.prefix)
@@ -155,6 +156,7 @@ class Weights:
             for found, weights in planned:
                 target = self.out / f"{found.network}.safetensors"
                 metadata = {"format": OURS, "config": self.config, "source": found.source.name}
+                metadata |= metadata_of(found.network, config.chunks)
                 origin = found.source.files
                 write_file(target, weights, origin=origin, metadata=metadata, keep_log=keep_logs)
             if kept:
@@ -245,6 +247,7 @@ class Lora:
     def run(self) -> int:
         """Read, check and write the LoRA."""
         from egosim_jax import configs
+        from egosim_jax.configs.model import metadata_of
         from egosim_jax.convert.lora import base_of, check_base, read_lora
         from egosim_jax.convert.lora_export import exported, exported_metadata
         from egosim_jax.convert.plan import merged
@@ -276,6 +279,7 @@ class Lora:
         file = self.merge / "dit.safetensors"
         weights = merged(read_safetensors(file), changes, config, scale=self.scale)
         metadata = {"format": OURS, "config": self.config, "lora": quote_path(self.source.name)}
+        metadata |= metadata_of("dit", configs.get(self.config).chunks)
         with lock_folder(self.out):
             write_file(self.out / file.name, weights, origin=[file, *origin], metadata=metadata)
             link_others(self.out, self.merge)

@@ -177,8 +177,7 @@ def write_trained(
             )
         return path
     folder = out / "weights"
-    for name, network in trained.parts().items():
-        weights.save(folder / f"{name}.safetensors", network, dtype=model.dit.dtype)
+    trained.save(folder, dtype=model.dit.dtype)
     if jax.process_index() == 0:
         weights.link_others(folder, start)
     return folder

@@ -23,6 +23,7 @@ from egosim_jax.diffusion.solver import DDIM, Euler
 from egosim_jax.diffusion.unipc import UniPC
 from egosim_jax.io import weights
 from egosim_jax.models import (
+    CausalDenoiserConfig,
     ChunkedCodecConfig,
     Denoiser,
     DenoiserConfig,
@@ -34,6 +35,7 @@ from egosim_jax.models import (
     VideoCodec,
     VideoCodecConfig,
 )
+from egosim_jax.models.chunks import Chunks
 from egosim_jax.models.layers import init_sharded
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
 from egosim_jax.models.wan.umt5 import UMT5Config
@@ -101,6 +103,8 @@ class ModelConfig:
     The prior is then not a condition. None: all steps, from pure noise."""
     steps: int | tuple[int | float, ...] = 50
     """Number of denoising steps, or the timesteps to visit."""
+    chunks: Chunks | None = None
+    """Chunks that the denoiser makes one after the other, a causal student; None: all at once."""
 
     def __post_init__(self) -> None:
         """Check that networks, input channels and video fit each other."""
@@ -144,6 +148,27 @@ class ModelConfig:
                 f"{self.name}: {frames} latent frames do not divide into tokens of {patch}. Change "
                 "the number of frames. (video.frames, dit.patch)"
             )
+        if self.chunks is not None:
+            self._check_causal(self.chunks)
+
+    def _check_causal(self, chunks: Chunks) -> None:
+        """Raise `InputError` for what a causal student cannot do."""
+        chunks.check(self.latent_shape[0])
+        if not isinstance(self.dit, CausalDenoiserConfig):
+            raise InputError(
+                f"{self.name}: the denoiser of {type(self.dit).__name__} is not causal, so it "
+                f"cannot make chunks of {chunks} latent frames one after the other. Omit them, to "
+                "make clips at once. (chunks)"
+            )
+        for option, value, usual in (
+            ("guidance.scale", self.guidance.scale, 1.0),
+            ("strength", self.strength, None),
+        ):
+            if value != usual:
+                raise InputError(
+                    f"{self.name} makes clips chunk by chunk, which supports only {option} "
+                    f"{usual}, not {value}. ({option}, chunks)"
+                )
 
     def _image_sizes(self) -> list[tuple[str, int | None, str, int | None]]:
         """Return the pair of widths of the image tokens, which must agree."""
@@ -244,9 +269,20 @@ class Networks(nnx.Module):
     vae: VideoCodec
     text: TextEncoder
     image: ImageEncoder | None
+    chunks: Chunks | None
+    """Chunks of a causal denoiser."""
 
-    def __init__(self, *, dit: Any = None, vae: Any = None, text: Any = None, image: Any = None):
+    def __init__(
+        self,
+        *,
+        dit: Any = None,
+        vae: Any = None,
+        text: Any = None,
+        image: Any = None,
+        chunks: Chunks | None = None,
+    ):
         self.dit, self.vae, self.text, self.image = dit, vae, text, image
+        self.chunks = chunks
 
     @classmethod
     def build(
@@ -258,7 +294,8 @@ class Networks(nnx.Module):
                 name: network.build(rngs=rngs)
                 for name, network in config.networks.items()
                 if only is None or name in only
-            }
+            },
+            chunks=config.chunks,
         )
 
     @classmethod
@@ -289,21 +326,31 @@ class Networks(nnx.Module):
         """Load networks from a weights folder, which holds `<network>.safetensors` for each.
 
         On a mesh, each device reads only its own part of the weights. Raises `InputError` with
-        every path that is missing, unknown or of another shape.
+        every path that is missing, unknown or of another shape, or if the denoiser makes other
+        chunks.
         """
         networks, folder = cls.abstract(config, only=only), Path(folder)
         if not folder.is_dir():
             raise InputError(f"{folder} is not a folder of weights. (--weights)")
         for name, network in networks.parts().items():
-            weights.load(folder / f"{name}.safetensors", network, mesh=mesh)
+            file = folder / f"{name}.safetensors"
+            if name == "dit" and file.is_file():
+                weights.check_chunks(file, metadata_of("dit", config.chunks).get(weights.CHUNKS))
+            weights.load(file, network, mesh=mesh)
         return networks
 
     def save(self, folder: Path, *, dtype: str | None = None) -> None:
         """Write a weights folder, cast to `dtype` if given."""
         for name, network in self.parts().items():
-            weights.save(folder / f"{name}.safetensors", network, dtype=dtype)
+            metadata = metadata_of(name, self.chunks)
+            weights.save(folder / f"{name}.safetensors", network, dtype=dtype, metadata=metadata)
 
     def parts(self) -> dict[str, nnx.Module]:
         """Return the networks that are present, by name."""
         named = {name: getattr(self, name) for name in NAMES}
         return {name: network for name, network in named.items() if network is not None}
+
+
+def metadata_of(network: str, chunks: Chunks | None) -> dict[str, str]:
+    """Return the text metadata of a network's weights: the chunks of a causal denoiser."""
+    return {} if chunks is None or network != "dit" else {weights.CHUNKS: str(chunks)}

@@ -23,9 +23,9 @@ and `dpm.py`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, SupportsIndex, runtime_checkable
+from typing import Any, NamedTuple, Protocol, SupportsIndex, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +34,8 @@ from jaxtyping import Array, Float, Key
 
 from egosim_jax.diffusion.process import DenoiseFn, Process, at_least_float32
 from egosim_jax.types import InputError
+
+Kept = TypeVar("Kept")
 
 
 @runtime_checkable
@@ -91,22 +93,64 @@ def integrate(
     `steps` is the number of steps, or the timesteps to visit. `keys`, one for each sample, draw the
     noise of a stochastic solver; step i uses `fold_in(key, i)`.
     """
+
+    def advance(state: Any, row: tuple) -> tuple[Any, None]:
+        return _advance(lambda x, t: (denoise(x, t), None), process, solver, state, row)
+
+    rows = _rows(process, solver, steps, keys)
+    return jax.lax.scan(advance, solver.start(noise), rows)[0].x
+
+
+def integrate_keeping(
+    denoise: Callable[[jax.Array, jax.Array], tuple[jax.Array, Kept]],
+    noise: Float[Array, "b f h w c"],
+    *,
+    process: Process,
+    solver: Solver,
+    steps: SupportsIndex | Sequence[int | float],
+    keys: Key[Array, " b"] | None = None,
+) -> tuple[Float[Array, "b f h w c"], Kept]:
+    """Return the latents, as `integrate` does, and the second result of the last evaluation."""
+    rows = _rows(process, solver, steps, keys)
+    before, last = jax.tree.map(lambda x: x[:-1], rows), jax.tree.map(lambda x: x[-1], rows)
+
+    def advance(state: Any, row: tuple) -> tuple[Any, None]:
+        return _advance(denoise, process, solver, state, row)[0], None
+
+    state, _ = jax.lax.scan(advance, solver.start(noise), before)
+    state, kept = _advance(denoise, process, solver, state, last)
+    return state.x, kept
+
+
+def _rows(
+    process: Process,
+    solver: Solver,
+    steps: SupportsIndex | Sequence[int | float],
+    keys: Key[Array, " b"] | None,
+) -> tuple:
+    """Return timesteps, coefficients and, of a stochastic solver, keys with a leading step axis."""
     times = process.times(steps)
     timesteps = process.timesteps(times[:-1]).astype(np.float32)
     rows = (timesteps, solver.coefficients(process, times))
-    if solver.stochastic:
-        if keys is None:
-            raise InputError(f"{type(solver).__name__} adds noise at its steps: it needs keys.")
-        fold = jax.vmap(jax.random.fold_in, in_axes=(0, None))
-        rows = (*rows, jax.vmap(fold, in_axes=(None, 0))(keys, jnp.arange(len(timesteps))))
+    if not solver.stochastic:
+        return rows
+    if keys is None:
+        raise InputError(f"{type(solver).__name__} adds noise at its steps: it needs keys.")
+    fold = jax.vmap(jax.random.fold_in, in_axes=(0, None))
+    return (*rows, jax.vmap(fold, in_axes=(None, 0))(keys, jnp.arange(len(timesteps))))
 
-    def body(state: Any, row: tuple) -> tuple[Any, None]:
-        t, coefficients, *step_keys = row
-        output = denoise(state.x, jnp.broadcast_to(t, noise.shape[:1]))
-        return solver.step(process, state, output, coefficients, *step_keys), None
 
-    state, _ = jax.lax.scan(body, solver.start(noise), rows)
-    return state.x
+def _advance(
+    denoise: Callable[[jax.Array, jax.Array], tuple[jax.Array, Kept]],
+    process: Process,
+    solver: Solver,
+    state: Any,
+    row: tuple,
+) -> tuple[Any, Kept]:
+    """Return the state after one step, and the second result of the network."""
+    t, coefficients, *step_keys = row
+    output, kept = denoise(state.x, jnp.broadcast_to(t, state.x.shape[:1]))
+    return solver.step(process, state, output, coefficients, *step_keys), kept
 
 
 class EulerState(NamedTuple):

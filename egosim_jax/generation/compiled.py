@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 from flax import nnx
-from jax.sharding import Mesh
+from jax.sharding import Mesh, NamedSharding
 
 from egosim_jax.io.executables import cached_compile
-from egosim_jax.sharding import batch_sharding, check_batch
+from egosim_jax.sharding import check_batch, spec
+
+Axes = tuple[str | None, ...]
+"""Logical axes of an activation (`sharding.ACTIVATIONS`)."""
+BATCH: Axes = ("batch",)
+"""Axes of an array with a leading batch axis."""
 
 
 class CompiledFn:
     """A function of networks and arrays, compiled once for each shape of its arguments.
 
-    On a mesh, `shard_params` must have placed the networks, and all arrays have a leading batch
-    axis. Raises `InputError` before compiling if the mesh does not divide the batch. With a
-    `cache_key`, which identifies function and config, compiled programs are cached on disk
-    (`io/executables.py`).
+    On a mesh, `shard_params` must have placed the networks. `in_axes` and `out_axes` are the
+    logical axes of the arrays of each argument and of each result; by default, all arrays have a
+    leading batch axis. The first array always has it. Raises `InputError` before compiling if the
+    mesh does not divide the batch. With a `cache_key`, which identifies function and config,
+    compiled programs are cached on disk (`io/executables.py`).
     """
 
     def __init__(
@@ -31,12 +37,15 @@ class CompiledFn:
         *,
         mesh: Mesh | None = None,
         cache_key: Any = None,
+        in_axes: Sequence[Axes] | None = None,
+        out_axes: Sequence[Axes] | None = None,
         **options: Any,
     ):
         graph, self._params = nnx.split(networks, nnx.Param)
-        self._mesh, self._cache_key = mesh, cache_key
+        self._mesh, self._cache_key, self._in_axes = mesh, cache_key, in_axes
         if mesh is not None:
-            options["out_shardings"] = batch_sharding(mesh)
+            shardings = [NamedSharding(mesh, spec(*axes)) for axes in out_axes or (BATCH,)]
+            options["out_shardings"] = shardings[0] if out_axes is None else tuple(shardings)
         # `nnx.jit` would traverse the networks at every call.
         self._jit = jax.jit(lambda p, *args: function(nnx.merge(graph, p), *args), **options)
         self._compiled: dict[Any, Any] = {}
@@ -69,20 +78,30 @@ class CompiledFn:
 
     def _placed(self, args: tuple) -> tuple:
         """Return the shapes and shardings of arguments."""
-        placed = None
+        shardings = self._shardings(args)
         if self._mesh is not None:
             check_batch(jax.tree.leaves(args)[0].shape[0], self._mesh)
-            placed = batch_sharding(self._mesh)
-        return jax.tree.map(
-            lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=placed), args
+        return tuple(
+            jax.tree.map(
+                lambda leaf, own=own: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=own),
+                arg,
+            )
+            for arg, own in zip(args, shardings, strict=True)
         )
+
+    def _shardings(self, args: tuple) -> tuple[NamedSharding | None, ...]:
+        """Return the sharding of the arrays of each argument; None on one device."""
+        if self._mesh is None:
+            return (None,) * len(args)
+        axes = self._in_axes or (BATCH,) * len(args)
+        return tuple(NamedSharding(self._mesh, spec(*own)) for own in axes)
 
     def __call__(self, *args: Any) -> Any:
         """Run the function; compile it first if necessary."""
         if (signature := _signature(args)) not in self._compiled:
             self.compile(*args)
         if self._mesh is not None:
-            args = jax.device_put(args, batch_sharding(self._mesh))
+            args = jax.device_put(args, self._shardings(args))
         return self._compiled[signature](self._params, *args)
 
     def _on_mesh(self) -> contextlib.AbstractContextManager[Any]:

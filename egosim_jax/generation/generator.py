@@ -8,6 +8,8 @@ condition's part of the patch embedding do not change between steps: they are co
 scan. The noise is donated. An item's noise depends only on its seed, so a clip does not depend on
 its batch.
 
+A causal student makes its chunks one after the other (`causal.py`).
+
 On a mesh (`sharding.py`), data x fsdp splits the batch. Devices along context share the denoising
 of a clip; each of them encodes and decodes the complete clip. If the devices belong to several
 processes, all of them make the same calls and get all clips.
@@ -16,8 +18,9 @@ processes, all of them make the same calls and get all clips.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +35,7 @@ from egosim_jax.conditioning.pixels import to_model, to_uint8
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.diffusion.process import DenoiseFn
 from egosim_jax.diffusion.solver import integrate
+from egosim_jax.generation.causal import ChunkDenoiser, chunks_of, denoise_chunks
 from egosim_jax.generation.compiled import CompiledFn
 from egosim_jax.generation.encoding import (
     SOLVER_NOISE,
@@ -43,7 +47,7 @@ from egosim_jax.generation.encoding import (
 )
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.run import plain
-from egosim_jax.models import Denoiser
+from egosim_jax.models import CausalDenoiser, Denoiser
 from egosim_jax.rendering import Renderer, jitted
 from egosim_jax.sharding import fetch, shard_params
 from egosim_jax.types import (
@@ -80,6 +84,8 @@ def denoise(
 
     `keys`, one for each item, draw the noise that a stochastic solver adds.
     """
+    if config.chunks is not None:
+        return denoise_chunks(cast(CausalDenoiser, dit), condition, noise, config, keys)
     if config.strength is not None and condition.prior is not None:
         # SDEdit: the prior, noised to the first level, is the start instead of a condition.
         start = jnp.asarray(config.process.times(config.visited)[0], jnp.float32)
@@ -148,6 +154,11 @@ class Generator:
             cache_key=("denoise", config),
             donate_argnums=2,
         )
+        self._chunks = (
+            None
+            if config.chunks is None
+            else ChunkDenoiser(config, cast(CausalDenoiser, networks.dit), mesh)
+        )
         self._decode = CompiledFn(
             lambda vae, x: to_uint8(vae.decode(x)),
             networks.vae,
@@ -198,9 +209,13 @@ class Generator:
         yield "encode", self._encode, (arrays,)
         seeds = jax.ShapeDtypeStruct((batch,), np.uint32)
         yield "noise", self._noise, (seeds,)
-        inputs = self._encode.shapes(arrays), self._noise.shapes(seeds), *self._step_seeds(seeds)
-        yield "denoise", self._denoise, inputs
-        yield "decode", self._decode, (self._denoise.shapes(*inputs),)
+        noise = self._noise.shapes(seeds)
+        inputs = self._encode.shapes(arrays), noise, *self._step_seeds(seeds)
+        if self._chunks is None:
+            yield "denoise", self._denoise, inputs
+        else:
+            yield from self._chunks.programs(*inputs)
+        yield "decode", self._decode, (noise,)
 
     def compile(self, batch: int) -> None:
         """Compile all functions of `generate` for batches of this size."""
@@ -233,12 +248,28 @@ class Generator:
         condition = self._encode(pack(triplets, self.config, seeds))
         if without is not None:
             condition = condition.drop(without)
-        step_seeds = self._step_seeds(last_32_bits(seeds))
-        latents = self._denoise(condition, self.noise(seeds), *step_seeds)
+        if self.config.chunks is None:
+            step_seeds = self._step_seeds(last_32_bits(seeds))
+            latents = self._denoise(condition, self.noise(seeds), *step_seeds)
+        else:
+            latents = jnp.concatenate(list(self.chunks(condition, seeds)), axis=1)
         bad = [n for n, latent in enumerate(fetch(latents)) if not np.isfinite(latent).all()]
         if bad:
             raise NonFiniteError([triplet.video_id for triplet in triplets], bad)
         return latents
+
+    def chunks(
+        self, condition: Condition, seeds: Sequence[int]
+    ) -> Iterator[Float[Array, "b f h w z"]]:
+        """Yield the latents of a causal student's chunks, without waiting for them.
+
+        Raises `InputError` for a model that makes clips at once.
+        """
+        bounds, noise = chunks_of(self.config).bounds, self.noise(seeds)
+        channels = self.config.layout.condition_channels(condition, noise)
+        parts = (channels[:, start:end] for start, end in pairwise(bounds))
+        given = condition.text, condition.image, parts, noise, last_32_bits(seeds)
+        yield from cast(ChunkDenoiser, self._chunks).latents(*given)
 
     def __call__(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from egosim_jax.io.atomic import atomic_write
-from egosim_jax.io.bounded import listing, quote_path
+from egosim_jax.io.bounded import listing, quote, quote_path
 from egosim_jax.io.mapped import (
     OURS,
     Tensor,
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from flax import nnx
     from jax.sharding import Mesh
 
+CHUNKS = "chunks"
+"""Metadata of a denoiser that is a causal student: the latent frames of its chunks."""
 MAX_LISTED = 12
 """Maximum number of mismatches in an error message."""
 
@@ -124,8 +126,14 @@ def hashes(folder: Path, *, only: Collection[str] | None = None) -> dict[str, st
     return {path.stem: read_weights_hash(path) for path in files}
 
 
-def save(path: Path, module: nnx.Module, *, dtype: str | None = None) -> None:
-    """Write the weights of a module as safetensors, atomically.
+def save(
+    path: Path,
+    module: nnx.Module,
+    *,
+    dtype: str | None = None,
+    metadata: Mapping[str, str] | None = None,
+) -> None:
+    """Write the weights of a module and text metadata as safetensors, atomically.
 
     `dtype` casts the tensors; the default keeps their own. All processes must call this together;
     the first process writes.
@@ -137,7 +145,7 @@ def save(path: Path, module: nnx.Module, *, dtype: str | None = None) -> None:
         if gathered is not None:
             tensors[name] = gathered
     if tensors:
-        write(path, tensors)
+        write(path, tensors, metadata=metadata)
 
 
 def write(
@@ -217,6 +225,23 @@ def _read(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise _absent(path)
     return read_safetensors(path)
+
+
+def check_chunks(file: Path, wanted: str | None) -> None:
+    """Raise `InputError` unless a file's denoiser makes these chunks; None: clips at once."""
+    found = read_metadata(file).get(CHUNKS)
+    if found == wanted:
+        return
+    has, needs = (
+        "a denoiser of whole clips"
+        if chunks is None
+        else f"a causal student with chunks of {quote(chunks)} latent frames"
+        for chunks in (found, wanted)
+    )
+    raise InputError(
+        f"{quote_path(file)} is {has}; the config needs {needs}. Give weights of this config, or "
+        "the config of these weights. (--weights, --config)"
+    )
 
 
 def check_folder(folder: Path, config: str) -> None:
