@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.models.attention import Kernel
+from egosim_jax.models.chunks import Chunks
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.train.config import TrainConfig
 from egosim_jax.train.recipe import Recipe
@@ -32,6 +33,7 @@ class FineTuning(Recipe):
         "object stores": ("cache", "cache_gb"),
         "method": (
             "rank",
+            "chunks",
             "times",
             "max_difference",
             "navigation",
@@ -57,6 +59,10 @@ class FineTuning(Recipe):
     """Maximum size of these copies in GB."""
     rank: int | None = None
     """Rank of a LoRA to train instead of the weights."""
+    chunks: tuple[int, ...] | None = None
+    """Latent frames of each chunk of a causal student; None: the model's.
+
+    The student learns from the clean chunks of the clip before each chunk (teacher forcing)."""
     times: Literal["uniform", "logit-normal", "diffsynth"] = "diffsynth"
     """Distribution and weighting of the noise levels."""
     max_difference: float | None = None
@@ -147,7 +153,9 @@ class FineTuning(Recipe):
                 f"The denoiser of {model.name} has no rematerialization {self.remat}: it must be "
                 f"one of {', '.join(levels)}. (--remat)"
             )
-        return replace(model, dit=replace(model.dit, **given))
+        # A refresh: the student has seen clean chunks, not the end of their denoising.
+        chunks = model.chunks if self.chunks is None else Chunks(sizes=self.chunks, refresh=True)
+        return replace(model, dit=replace(model.dit, **given), chunks=chunks)
 
 
 def write_trained(

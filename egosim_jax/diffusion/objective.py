@@ -26,6 +26,7 @@ trainer, at 50), so one corrupt value does not spoil an update.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -39,10 +40,10 @@ from egosim_jax.types import InputError, check_counts
 
 
 class Sampled(NamedTuple):
-    """Time and error of each sample of a batch."""
+    """Time and error of each sample of a batch, or of each of its frames."""
 
-    time: Float[Array, " b"]
-    error: Float[Array, " b"]
+    time: Float[Array, " *times"]
+    error: Float[Array, " *times"]
     """Mean squared error of the prediction, not weighted by the time."""
 
 
@@ -99,7 +100,7 @@ class Objective:
         z = self.logit_mean + self.logit_std * jax.vmap(jax.random.normal)(keys)
         return process.warp(jax.nn.sigmoid(z))
 
-    def weight(self, process: Process, time: Float[Array, " b"]) -> Float[Array, " b"]:
+    def weight(self, process: Process, time: Float[Array, " *times"]) -> Float[Array, " *times"]:
         """Return the weight of the error at these times; 1 on average over the times drawn."""
         if self.times != "diffsynth":
             return jnp.ones_like(time)
@@ -115,14 +116,25 @@ class Objective:
         key: Key[Array, " *keys"],
         *,
         loss_weights: Float[Array, "b f h w 1"] | float = 1.0,
+        chunks: Sequence[int] | None = None,
     ) -> tuple[Float[Array, ""], Sampled]:
         """Return the weighted error at random times, averaged over the batch.
 
         `key` is one key, or one for each sample. A sample's draws depend only on its own key, not
-        on the batch. `loss_weights` weights the locations of each sample, 1 on average.
+        on the batch. `loss_weights` weights the locations of each sample, 1 on average. With
+        `chunks`, numbers of frames, each chunk of a sample has its own time, and each frame a time
+        and an error.
         """
         keys = jax.vmap(jax.random.split)(sample_keys(key, x0.shape[0]))
-        time = self.sample_times(process, keys[:, 0], x0.shape[0])
+        if chunks is None:
+            time = self.sample_times(process, keys[:, 0], x0.shape[0])
+        else:
+            own = jax.vmap(lambda k: jax.random.split(k, len(chunks)))(keys[:, 0])
+            drawn = [
+                jnp.tile(self.sample_times(process, own[:, n], len(x0))[:, None], (1, frames))
+                for n, frames in enumerate(chunks)
+            ]
+            time = jnp.concatenate(drawn, axis=1)
         noise = jax.vmap(lambda k: jax.random.normal(k, x0.shape[1:]))(keys[:, 1])
         error = self.loss_at(process, denoise, x0, noise, time, loss_weights=loss_weights)
         return (self.weight(process, time) * error).mean(), Sampled(time, error)
@@ -133,21 +145,23 @@ class Objective:
         denoise: DenoiseFn,
         x0: Float[Array, "b f h w c"],
         noise: Float[Array, "b f h w c"],
-        time: Float[Array, " b"],
+        time: Float[Array, " *times"],
         *,
         loss_weights: Float[Array, "b f h w 1"] | float = 1.0,
-    ) -> Float[Array, " b"]:
+    ) -> Float[Array, " *times"]:
         """Return each sample's error at a given noise and time, in float32.
 
-        The error is weighted over locations, not by time.
+        The error is weighted over locations, not by time. With a time for each frame, it is each
+        frame's.
         """
         x0, noise = x0.astype(jnp.float32), noise.astype(jnp.float32)
-        level = time[:, None, None, None, None]
+        level = jnp.expand_dims(time, tuple(range(time.ndim, x0.ndim)))
         output = denoise(process.add_noise(x0, noise, level), process.timesteps(time))
         difference = output.astype(jnp.float32) - process.target(x0, noise, level)
         if self.max_difference is not None:
             difference = jnp.where(jnp.abs(difference) <= self.max_difference, difference, 0)
-        return (loss_weights * jnp.square(difference)).mean(axis=(1, 2, 3, 4))
+        errors = loss_weights * jnp.square(difference)
+        return errors.mean(axis=tuple(range(time.ndim, x0.ndim)))
 
 
 def sample_keys(key: Key[Array, " *keys"], batch: int) -> Key[Array, " b"]:

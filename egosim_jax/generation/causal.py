@@ -54,7 +54,7 @@ def denoise_chunk(
     number: int,
     keys: Key[Array, " b"] | None = None,
 ) -> tuple[Float[Array, "b f h w z"], Any]:
-    """Return the latents of a clip's chunk by number, and the cache with this chunk.
+    """Return the latents of a clip's chunk by number, and the cache for the next chunk.
 
     `channels` are the condition channels of the chunk. `keys`, one for each item, draw the noise
     that a stochastic solver adds.
@@ -70,6 +70,8 @@ def denoise_chunk(
         steps=config.steps if number or chunks.first_steps is None else chunks.first_steps,
         keys=own,
     )
+    if number == len(chunks.sizes) - 1:  # no later chunk sees the last one
+        return latents, cache
     if chunks.refresh:
         _, kept = dit.denoise_chunk(latents, jnp.zeros(len(latents)), context, cache)
     return latents, cache.put(kept)
@@ -151,11 +153,11 @@ class ChunkDenoiser:
 
     def latents(
         self,
-        text: Float[Array, "b n d"],
-        image: Float[Array, "b m e"] | None,
-        conditions: Iterable[Float[Array, "b f h w c"]],
-        noise: Float[Array, "b f h w z"],
-        seeds: UInt32[Array, " b"] | None = None,
+        text: Float[Any, "b n d"],
+        image: Float[Any, "b m e"] | None,
+        conditions: Iterable[Float[Any, "b _ h w c"]],
+        noise: Float[Any, "b f h w z"],
+        seeds: UInt32[Any, " b"] | None = None,
     ) -> Iterator[Float[Array, "b f h w z"]]:
         """Yield the latents of each chunk, without waiting until they are computed.
 

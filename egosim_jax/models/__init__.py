@@ -13,7 +13,7 @@ satisfy the Protocols of this module.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int
@@ -95,7 +95,7 @@ class CausalDenoiser(Denoiser, Protocol):
 class Cache(Protocol):
     """Memory of a causal denoiser, of the finished chunks of a clip; a pytree."""
 
-    def put(self, chunk: Any) -> Self:
+    def put(self, chunk: Any) -> Cache:
         """Return the cache with one more chunk, by the second result of `denoise_chunk`."""
         ...
 

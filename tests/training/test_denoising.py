@@ -12,6 +12,7 @@ from flax import nnx
 
 from egosim_jax.conditioning.layout import ChannelLayout
 from egosim_jax.configs.model import Networks
+from egosim_jax.models.chunks import Chunks
 from egosim_jax.train.tasks.denoising import Denoising, draw_latents, loss_weights, without_hands
 from egosim_jax.types import InputError
 from tests.training.run_tiny import MODEL
@@ -84,6 +85,10 @@ class Seen:
     def denoise(self, noisy, t, context):
         return jnp.zeros_like(noisy)
 
+    def denoise_packed(self, clean, noisy, t, context, chunks):
+        self.clean, self.noisy, self.t = clean, noisy, t
+        return jnp.zeros_like(noisy)
+
     def part(self, name):
         where = MODEL.layout.slice(name)
         return self.condition[..., where.start - 16 : where.stop - 16]
@@ -117,6 +122,21 @@ def test_the_loss_is_that_of_latents_drawn_from_their_posteriors(batch):
     assert loss == pytest.approx(1 + 1 + 4, rel=0.15)  # of noise, means and draws
     for name in ("prior", "hands"):
         assert (dit.part(name) - batch[name]).std() == pytest.approx(2, rel=0.15)
+
+
+def test_a_student_sees_clean_chunks_and_noisy_ones_of_their_own_levels(batch):
+    model = dataclasses.replace(MODEL, chunks=Chunks(sizes=(1, 1)))
+    loss, dit = seen(batch, model)
+    np.testing.assert_array_equal(dit.clean, batch["target"])
+    level = dit.t[:, :, None, None, None] / 1000
+    assert len(set(level.ravel().tolist())) == 4  # two samples of two chunks
+    noise = (dit.noisy - (1 - level) * dit.clean) / level
+    assert loss == pytest.approx(float(jnp.square(noise - dit.clean).mean()), rel=1e-4)
+    task = Denoising(model=model)
+    errors = task.validate(Networks(dit=dit), batch | {"record": jnp.arange(2)})
+    assert {error.shape for error in errors.values()} == {(2,)}
+    whole = Denoising(model=MODEL)
+    assert whole.flops(2) < task.flops(2) < 2 * whole.flops(2)
 
 
 def test_the_loss_of_navigation_is_that_of_the_camera_alone(batch):

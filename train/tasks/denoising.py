@@ -2,17 +2,19 @@
 
 The loss is the diffusion objective (`diffusion/objective.py`). Condition dropout removes prior,
 mask, hands and text at random (`conditioning/condition.py`). DWM draws the latents from their
-posteriors at each update (`conditioning/posterior.py`).
+posteriors at each update (`conditioning/posterior.py`). A causal student learns by teacher forcing:
+each chunk has its own noise level, and sees the clean chunks of the target before it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float, Key
 
@@ -23,7 +25,7 @@ from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.diffusion.objective import Objective
 from egosim_jax.diffusion.process import DenoiseFn
 from egosim_jax.generation.encoding import encode_condition
-from egosim_jax.models import lora
+from egosim_jax.models import CausalDenoiser, CausalDenoiserConfig, lora
 from egosim_jax.train.update import Batch, Metrics
 from egosim_jax.types import InputError
 
@@ -122,7 +124,10 @@ class Denoising:
         process, target = self.model.process, batch["target"]
         denoise = _denoise(self.model, networks, condition, target)
         weights = loss_weights(target, batch.get("prior", target), self.change_loss_weight)
-        loss, _ = self.objective.loss(process, denoise, target, keys[:, 1], loss_weights=weights)
+        chunks = self.model.chunks and self.model.chunks.sizes
+        loss, _ = self.objective.loss(
+            process, denoise, target, keys[:, 1], loss_weights=weights, chunks=chunks
+        )
         return loss, {}
 
     def validate(self, networks: Networks, batch: Batch) -> Metrics:
@@ -135,22 +140,27 @@ class Denoising:
         denoise = _denoise(self.model, networks, condition, target)
         keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), batch["record"])
         noise = jax.vmap(lambda key: jax.random.normal(key, target.shape[1:]))(keys)
-        errors = {
-            f"loss_{sigma}": self.objective.loss_at(
-                self.model.process, denoise, target, noise, jnp.full(target.shape[:1], sigma)
-            )
-            for sigma in VALIDATION_SIGMAS
-        }
+        axes = 1 if self.model.chunks is None else 2  # a student's chunks have their own times
+        errors = {}
+        for sigma in VALIDATION_SIGMAS:
+            time = jnp.full(target.shape[:axes], sigma)
+            error = self.objective.loss_at(self.model.process, denoise, target, noise, time)
+            errors[f"loss_{sigma}"] = error if axes == 1 else error.mean(axis=1)
         return {"loss": jnp.stack(list(errors.values())).mean(axis=0), **errors}
 
     def flops(self, samples: int) -> float:
         """Return the model FLOPs of an update, of the denoiser alone, which has nearly all."""
         model = self.model
-        forward = model.dit.forward_flops(
-            latents=model.latent_shape,
-            text=model.tokenizer.max_tokens,
-            image=model.image_tokens,
-        )
+        sizes = {
+            "latents": model.latent_shape,
+            "text": model.tokenizer.max_tokens,
+            "image": model.image_tokens,
+        }
+        if model.chunks is None:
+            forward = model.dit.forward_flops(**sizes)
+        else:
+            dit = cast(CausalDenoiserConfig, model.dit)
+            forward = dit.packed_flops(**sizes, chunks=model.chunks)
         # Forward, then gradients of activations and of weights; a LoRA's weights cost little.
         weights = 3 if self.rank is None else 2
         return samples * (weights * forward.weights + 3 * forward.attention)
@@ -201,6 +211,12 @@ def loss_weights(
 def _denoise(
     model: ModelConfig, networks: Networks, condition: Condition, latents: Float[Array, "b f h w c"]
 ) -> DenoiseFn:
-    dit, channels = networks.dit, model.layout.condition_channels(condition, latents)
+    dit, chunks = networks.dit, model.chunks
+    channels = model.layout.condition_channels(condition, latents)
     context = dit.prepare(channels, condition.text, condition.image)
-    return lambda x, t: dit.denoise(x, t, context)
+    if chunks is None:
+        return lambda x, t: dit.denoise(x, t, context)
+    # Each latent frame has a timestep.
+    first = np.array(chunks.bounds[:-1])
+    student = cast(CausalDenoiser, dit)
+    return lambda x, t: student.denoise_packed(latents, x, t[:, first], context, chunks)

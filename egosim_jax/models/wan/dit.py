@@ -249,7 +249,7 @@ class WanDiT(nnx.Module):
         self,
         clean: Float[Array, "b f h w c"],
         noisy: Float[Array, "b f h w c"],
-        t: Float[Array, "b c"],
+        t: Float[Array, "b k"],
         context: DiTContext,
         chunks: Chunks,
     ) -> Float[Array, "b f h w c"]:

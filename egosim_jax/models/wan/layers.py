@@ -49,7 +49,7 @@ IMAGE_NORM_EPS = 1e-5
 """Epsilon of the image embedding's norms, which differ from all others in Wan 2.1."""
 
 Activation = Callable[[jax.Array], jax.Array]
-KeysValues = tuple[Float[Array, "*l b _ h k"], Float[Array, "*l b _ h k"]]
+KeysValues = tuple[Float[Array, "*l b _ heads k"], Float[Array, "*l b _ heads k"]]
 Attend = Callable[[jax.Array, jax.Array, jax.Array], tuple[Float[Array, "b n h k"], Any]]
 """Self-attention of queries, keys and values by head: the result, and what to keep of the layer."""
 

@@ -109,6 +109,19 @@ def test_a_batch_with_its_own_keys_equals_batches_of_one(x0, times):
 
 
 @pytest.mark.parametrize("times", TIMES)
+def test_chunks_have_their_own_levels_and_frames_their_errors(times):
+    x0 = jax.random.normal(jax.random.key(8), (3, 4, 4, 4, 16))
+    by_frame = lambda x, t: jnp.sin(x) + t[:, :, None, None, None] / 1000  # noqa: E731
+    objective = Objective(times=times)
+    loss, sampled = objective.loss(PROCESS, by_frame, x0, jax.random.key(3), chunks=(1, 2, 1))
+    np.testing.assert_array_equal(sampled.time[:, 1], sampled.time[:, 2])
+    assert len(set(sampled.time.ravel().tolist())) == 9
+    assert sampled.error.shape == (3, 4)
+    weighted = objective.weight(PROCESS, sampled.time) * sampled.error
+    assert float(loss) == pytest.approx(float(weighted.mean()), rel=1e-6)
+
+
+@pytest.mark.parametrize("times", TIMES)
 def test_each_sample_of_a_batch_has_its_own_level_and_noise(times):
     x0 = jnp.zeros(SHAPE)
     seen = []

@@ -52,12 +52,17 @@ def given(batch):
     return clip.text, clip.image, [channels[:, :1], channels[:, 1:]], noise(batch)
 
 
-@pytest.fixture(scope="module")
-def dit():
-    dit = Networks.random(STUDENT, seed=0).dit
+def network():
+    """Return a denoiser with random weights."""
+    dit = nnx.jit(lambda: STUDENT.dit.build(rngs=nnx.Rngs(0)))()
     kernel = dit.head.linear.kernel
     kernel[...] = 0.1 * jax.random.normal(jax.random.key(1), kernel[...].shape)  # not zero
     return dit
+
+
+@pytest.fixture(scope="module")
+def dit():
+    return network()
 
 
 @pytest.fixture(scope="module")

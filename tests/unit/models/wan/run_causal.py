@@ -7,12 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from egosim_jax.configs.model import Networks
 from egosim_jax.generation.causal import ChunkDenoiser
 from egosim_jax.models.chunks import Chunks
 from egosim_jax.sharding import batch_sharding, make_mesh, shard_params
 from egosim_jax.types import MeshConfig
-from tests.unit.generation.test_causal import STUDENT, given
+from tests.unit.generation.test_causal import STUDENT, given, network
 from tests.unit.models.wan import causal_reference as reference
 
 SIZES, BATCH = (1, 2, 1), 4
@@ -32,8 +31,7 @@ def forms(graph, sizes):
 
         gradients, packed = jax.grad(loss, has_aux=True)(state)
         cached = reference.cached(nnx.merge(graph, state), sizes, clean, noisy, t, *conditions)
-        flat = jnp.concatenate([x.ravel() for x in jax.tree.leaves(gradients)])
-        return packed, cached, flat
+        return packed, cached, jax.tree.leaves(gradients)
 
     return jax.jit(run)
 
@@ -42,7 +40,7 @@ def main(out):
     """Compute the same with every mesh."""
     graph, state = reference.network()
     arrays = reference.inputs(sum(SIZES), len(SIZES), batch=BATCH)
-    networks = Networks.random(STUDENT, seed=0)
+    dit = network()
     found = {}
     for name, sizes in MESHES.items():
         mesh = sizes and make_mesh(MeshConfig(**dict(zip(("data", "fsdp", "context"), sizes))))  # noqa: B905
@@ -54,10 +52,11 @@ def main(out):
                     nnx.state(shard_params(nnx.merge(graph, state), mesh)),
                     *jax.device_put(arrays, batch_sharding(mesh)),
                 )
-        student = ChunkDenoiser(STUDENT, shard_params(networks.dit, mesh), mesh)
+        student = ChunkDenoiser(STUDENT, shard_params(dit, mesh), mesh)
         found[f"{name}: generated"] = np.concatenate(list(student.latents(*given(BATCH))), axis=1)
         for form, result in zip(("packed", "cached", "gradients"), results, strict=True):
-            found[f"{name}: {form}"] = np.asarray(result)
+            flat = [np.ravel(array) for array in jax.tree.leaves(result)]
+            found[f"{name}: {form}"] = np.concatenate(flat)
     np.savez(out, **found)
 
 
