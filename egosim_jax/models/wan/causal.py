@@ -110,14 +110,11 @@ def cached(past: KeysValues | None, start: int, kernel: Kernel) -> Attend:
     """
 
     def attend(q: jax.Array, k: jax.Array, v: jax.Array, *past: jax.Array) -> tuple[Any, Any]:
-        seen = (
-            [
-                jnp.concatenate([old[:, :start], new], axis=1)
-                for old, new in zip(past, (k, v), strict=True)
-            ]
-            if past
-            else [k, v]
-        )
+        joined = [
+            jnp.concatenate([old[:, :start], new], axis=1)
+            for old, new in zip(past, (k, v), strict=False)  # the first chunk has no past
+        ]
+        seen = joined or (k, v)
         return attention(q, *seen, kernel=kernel), (k, v)
 
     def split(q: jax.Array, k: jax.Array, v: jax.Array) -> tuple[Any, Any]:
@@ -128,9 +125,9 @@ def cached(past: KeysValues | None, start: int, kernel: Kernel) -> Attend:
 
 
 def by_run(x: Float[Array, "b g *d"], lengths: Sequence[int]) -> Float[Array, "b u *d"]:
-    """Return the vectors of runs of tokens as vectors of equal runs.
+    """Return the vectors of runs of tokens of these lengths as the vectors of equal runs.
 
-    As many as possible of the devices along context have whole runs.
+    Each device along context has whole equal runs.
     """
     if len(lengths) == 1:
         return x
