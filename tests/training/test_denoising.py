@@ -124,7 +124,7 @@ def test_the_loss_is_that_of_latents_drawn_from_their_posteriors(batch):
         assert (dit.part(name) - batch[name]).std() == pytest.approx(2, rel=0.15)
 
 
-def test_a_student_sees_clean_chunks_and_noisy_ones_of_their_own_levels(batch):
+def test_a_student_sees_clean_chunks_and_each_noisy_chunk_has_a_level(batch):
     model = dataclasses.replace(MODEL, chunks=Chunks(sizes=(1, 1)))
     loss, dit = seen(batch, model)
     np.testing.assert_array_equal(dit.clean, batch["target"])
