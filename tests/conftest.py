@@ -1,7 +1,9 @@
 """Programs compile quickly; workers, what they start and the next run share them."""
 
+import gc
 import os
 import re
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -24,6 +26,27 @@ def pytest_ignore_collect(collection_path: Path) -> bool | None:
     return None
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Leave what is imported out of every search for garbage."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> Iterator[None]:
+    """Leave out what a module keeps, too: jax's traces, of which a search takes seconds."""
+    done = yield
+    if nextitem is None or nextitem.path != item.path:
+        gc.collect()
+        gc.freeze()
+    return done
+
+
 @pytest.fixture(scope="session")
 def debug_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Random weights of `debug`, which no test changes."""
@@ -31,3 +54,9 @@ def debug_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from egosim_jax.testing import write_weights
 
     return write_weights(tmp_path_factory.mktemp("debug"), configs.get("debug"))
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw no curves on the page of a training: they take most of a short one."""
+    monkeypatch.setattr("egosim_jax.train.run_page.draw_curves", lambda plots: b"<svg/>")

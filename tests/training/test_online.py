@@ -103,7 +103,8 @@ def test_a_deeper_denoiser_computes_the_same(tmp_path):
     shapes = ((1, 3, 4, 4, 52), (1, 5, DEBUG.dit.text_dim), (1, 5, DEBUG.dit.image_dim))
     latents, text, image = (jnp.asarray(draw.normal(size=s), jnp.float32) for s in shapes)
     inputs = latents, jnp.array([500.0]), text, image
-    expected, found = networks.dit(*inputs), deep(*inputs)
+    answer = nnx.jit(lambda network: network(*inputs))
+    expected, found = answer(networks.dit), answer(deep)
     np.testing.assert_allclose(found, expected, atol=1e-6)
     assert (folder / "vae.safetensors").exists()
     assert deepen_weights(tmp_path / "two", 2, tmp_path / "same") == tmp_path / "two"
@@ -158,8 +159,9 @@ def test_grouped_muon_equals_muon_of_each_weight():
     )
     updates = []
     for optimizer in (single, make_optimizer(config)):
-        found, state = optimizer.update(gradients, optimizer.init(params), params)
-        found, _ = optimizer.update(gradients, state, params)
+        update = jax.jit(optimizer.update)
+        found, state = update(gradients, optimizer.init(params), params)
+        found, _ = update(gradients, state, params)
         updates.append(jax.tree.leaves(found))
     for one, other in zip(*updates, strict=True):
         np.testing.assert_allclose(other, one, atol=1e-4)
