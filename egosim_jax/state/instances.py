@@ -102,7 +102,7 @@ def _heights(
     tolerance = max(search.min_height_m, 0.008 * float(np.median(cloud[:, 2])))
     lowest = np.full(len(cloud), np.nan)
     noise = np.full(len(cloud), search.min_height_m)
-    surfaces = support_planes(cloud, UP, tolerance_m=tolerance)
+    surfaces = support_planes(cloud, UP, eye_m=np.zeros(3), tolerance_m=tolerance)
     for surface in _without_tops(surfaces, cloud, search):
         height, deviation, inside = _above(surface, cloud, tolerance, search)
         limit = max(search.min_height_m, 3 * deviation)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32
 
 LIGHTNESS = 0.5
-"""Weight of a difference in lightness, which shading changes, beside one of hue."""
+"""Weight of a difference in lightness, which shading changes, relative to hue."""
 
 
 @dataclass(frozen=True, kw_only=True)
