@@ -45,7 +45,7 @@ class ObjectSearch:
     max_foot_m: float = 0.03
     """Maximum height of an object's lowest part above what it stands on, in meters."""
     outline_m: float = 0.05
-    """Distance by which objects may stand out over the visible outline of a surface, in meters."""
+    """Maximum distance of an object from the visible outline of its surface, in meters."""
     min_points: int = 30
     """Minimum number of pixels of an object in the image as it is given."""
     regions: RegionConfig = field(default_factory=RegionConfig)
@@ -238,7 +238,7 @@ def _grow_down(
 ) -> Int32[np.ndarray, "h w"]:
     """Return labels with the feet of objects, which are nearer to the surface than its noise.
 
-    A pixel beside an object belongs to it if its color is nearer to the object's beside it than to
+    A pixel next to an object belongs to it if its color is nearer to the object's there than to
     the surface's around it.
     """
     import cv2

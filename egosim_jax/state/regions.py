@@ -2,8 +2,8 @@
 
 Pixels are cut where the depth jumps, and then by color (Felzenszwalb and Huttenlocher, 2004).
 Neighboring regions are joined unless their common border is concave and their colors differ: a
-label continues the surface of its bottle, and a box beside another box does not. Separate pieces of
-one color are joined if they are close: a cup and its handle.
+label continues the surface of its bottle, and a box next to another box does not. Separate pieces
+of one color are joined if they are close: a cup and its handle.
 """
 
 from __future__ import annotations

@@ -5,7 +5,6 @@ import pytest
 
 from egosim_jax.state.planes import fit_plane, support_planes
 
-
 UP = np.array([0.0, 0.0, 1.0])
 
 
