@@ -187,9 +187,7 @@ def _walls(
             break
         plane, inliers = fit_plane(cloud[rest], tolerance_m)
         upright = abs(plane[:3] @ surfaces[0].plane[:3]) < np.cos(np.radians(WALL_TILT_DEG))
-        if area_of(cloud[rest[inliers]], plane) < WALL_AREA_M2:
-            break
-        if upright:
+        if upright and area_of(cloud[rest[inliers]], plane) >= WALL_AREA_M2:
             found += rest[inliers].tolist()
         rest = np.delete(rest, inliers)
     return found

@@ -1,18 +1,20 @@
 """Regions of an RGB-D image that are one object each.
 
 Pixels are cut where the depth jumps, and then by color (Felzenszwalb and Huttenlocher, 2004).
-Neighboring regions are joined unless their common border is concave and their colors differ: a
-label continues the surface of its bottle, and a box next to another box does not. Separate pieces
-of one color are joined if they are close: a cup and its handle.
+Neighboring regions are joined by the sum of the evidence of their borders. A concave border between
+two colors is evidence of two objects; any other border is of one: a label continues the surface of
+its bottle. Separate pieces of one color are joined if they are close: a cup and its handle.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32
 
+WEAK = 0.25
+"""Evidence of a border that is smooth or has one color, but not both, relative to a sure one."""
 LIGHTNESS = 0.5
 """Weight of a difference in lightness, which shading changes, relative to hue."""
 
@@ -22,13 +24,13 @@ class RegionConfig:
     """Thresholds of the division into regions."""
 
     color_scale: float = 60.0
-    """Preference for large regions (k of the algorithm), in units of CIELAB times pixels."""
+    """Preference for large regions (k of the algorithm), in CIELAB times pixels of 160 a row."""
     steepness: float = 4.0
     """Step of the depth that is a jump, in widths of a pixel's footprint."""
     min_jump_m: float = 0.006
     """Minimum step of the depth that is a jump, in meters."""
-    min_pixels: int = 12
-    """Number of pixels below which a region joins its most similar neighbor."""
+    min_pixels: float = 12.0
+    """Size below which a region joins its most similar neighbor, in pixels of 160 a row."""
     concavity: float = 0.25
     """Minimum sine of the bend of a concave border."""
     color_difference: float = 8.0
@@ -72,6 +74,12 @@ def find_regions(
 ) -> Int32[np.ndarray, "h w"]:
     """Return the region of each candidate pixel, from 1; 0 elsewhere."""
     color = lab * np.array([LIGHTNESS, 1, 1], np.float32)
+    finer = (max(candidates.shape) / 160) ** 2
+    config = replace(
+        config,
+        color_scale=config.color_scale * finer,
+        min_pixels=config.min_pixels * finer,
+    )
     pairs = _neighbors(points[..., 2], candidates, footprint_m, config)
     parts = _by_color(color.reshape(-1, 3), candidates.ravel(), pairs, config)
     parts = _join_surfaces(parts, points, color, pairs, config)
@@ -155,7 +163,7 @@ def _join_surfaces(
     pairs: Int[np.ndarray, "e 2"],
     config: RegionConfig,
 ) -> Int[np.ndarray, " n"]:
-    """Join neighboring parts unless their border is concave and their colors differ."""
+    """Join neighboring parts by the bend of their borders and the contrast of their colors."""
     height, width = points.shape[:2]
     reach = max(1, round(max(height, width) / 160))
     normals = _normals(points, parts.reshape(height, width), reach).reshape(-1, 3)
@@ -166,19 +174,52 @@ def _join_surfaces(
     one, other = _inward(border, parts, width, reach)
     apart = flat[one] - flat[other]
     apart /= np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-9)
-    convex = ((normals[one] - normals[other]) * apart).sum(axis=1)
+    convex = np.nan_to_num(((normals[one] - normals[other]) * apart).sum(axis=1))
     differ = np.linalg.norm(colors[one] - colors[other], axis=1)
     keys = np.sort(np.stack([parts[border[:, 0]], parts[border[:, 1]]], axis=1), axis=1)
     names, inverse = np.unique(keys, axis=0, return_inverse=True)
-    sets = _Sets(int(parts.max()) + 1)
+    weights = {}
     for number, (a, b) in enumerate(names.tolist()):
         here = inverse.ravel() == number
-        concave = float(np.nanmedian(convex[here])) < -config.concavity
-        if not (concave and float(np.median(differ[here])) > config.color_difference):
-            a, b = sets.find(a), sets.find(b)
-            if a != b:
-                sets.join(a, b)
-    return np.where(parts >= 0, sets.labels()[np.maximum(parts, 0)], -1)
+        bend, contrast = float(np.median(convex[here])), float(np.median(differ[here]))
+        weights[a, b] = int(here.sum()) * _score(bend, contrast, config)
+    joined = _contract(weights)
+    return np.array([joined.get(part, part) for part in parts.tolist()], int)
+
+
+def _score(bend: float, contrast: float, config: RegionConfig) -> float:
+    """Return the evidence of a border, per pixel, that both sides are one object."""
+    same = contrast <= config.color_difference
+    if bend < -config.concavity:
+        return WEAK if same else -1.0
+    return 1.0 if same or bend > config.concavity else WEAK
+
+
+def _contract(weights: dict[tuple[int, int], float]) -> dict[int, int]:
+    """Return the group of each part, by greedy additive edge contraction (Keuper et al., 2015).
+
+    The pair with the largest weight is joined, and the weights of its neighbors are added, until no
+    positive weight is left.
+    """
+    near: dict[int, dict[int, float]] = {}
+    for (one, other), weight in weights.items():
+        near.setdefault(one, {})[other] = weight
+        near.setdefault(other, {})[one] = weight
+    group = {part: part for part in near}
+    while near:
+        weight, one, other = max(
+            ((w, a, b) for a, row in near.items() for b, w in row.items() if a < b),
+            default=(0.0, 0, 0),
+        )
+        if weight <= 0:
+            break
+        for part, now in group.items():
+            group[part] = one if now == other else now
+        for third, more in near.pop(other).items():
+            near[third].pop(other)
+            if third != one:
+                near[one][third] = near[third][one] = near[one].get(third, 0.0) + more
+    return group
 
 
 def _inward(
