@@ -43,7 +43,10 @@ class ObjectSearch:
     max_extent_m: float = 0.6
     """Maximum extent of an object along each axis, in meters."""
     max_foot_m: float = 0.03
-    """Maximum height of an object's lowest part above what it stands on, in meters."""
+    """Maximum height of an object's lowest visible part above its surface, in meters.
+
+    Half of the object's height is allowed, too: a camera above a ball does not see its lower part.
+    """
     outline_m: float = 0.05
     """Maximum distance of an object from the visible outline of its surface, in meters."""
     min_points: int = 30
@@ -207,14 +210,15 @@ def _keep_objects(
     import cv2
 
     numbers, counts = np.unique(labels[labels > 0], return_counts=True)
-    fits = {}
+    fits, standing = {}, set()
     for number, count in zip(numbers.tolist(), counts.tolist(), strict=True):
         own = labels == number
         low, high = np.quantile(heights[own], [0.03, 0.97])
         extent = np.ptp(np.quantile(points[own], [0.02, 0.98], axis=0), axis=0).max()
         if count >= min_pixels and high >= search.min_top_m and extent <= search.max_extent_m:
             fits[number] = low
-    standing = {number for number, low in fits.items() if low <= search.max_foot_m}
+            if low <= max(search.max_foot_m, high / 2):
+                standing.add(number)
     for number in sorted(fits.keys() - standing, key=lambda n: fits[n]):
         own = labels == number
         around = cv2.dilate(own.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0

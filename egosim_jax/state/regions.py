@@ -36,9 +36,9 @@ class RegionConfig:
     color_difference: float = 8.0
     """Minimum difference between the colors of two objects, in units of CIELAB."""
     gap_m: float = 0.012
-    """Maximum distance between two pieces of an object, in meters."""
+    """Maximum distance of a small piece from its object, in meters; half of it for a large one."""
     piece: float = 0.25
-    """Maximum size of a separate piece, as a fraction of the larger one's."""
+    """Maximum size of a small piece, as a fraction of its object's."""
 
 
 class _Sets:
@@ -275,7 +275,7 @@ def _join_pieces(
     color: Float32[np.ndarray, "n 3"],
     config: RegionConfig,
 ) -> Int[np.ndarray, " n"]:
-    """Join separate small parts with a close larger part of the same color."""
+    """Join each separate part with the closest larger part of the same color."""
     from scipy.spatial import KDTree
 
     numbers, counts = np.unique(parts[parts >= 0], return_counts=True)
@@ -285,12 +285,13 @@ def _join_pieces(
     for number in order:
         own = np.flatnonzero(parts == number)
         hue = np.median(color[own], axis=0)
-        best = (config.gap_m, -1)
+        best = (np.inf, -1)
         for other, tree, other_hue in kept:
-            similar = np.linalg.norm(hue - other_hue) <= config.color_difference
-            if similar and sizes[number] <= config.piece * sizes[other]:
+            if np.linalg.norm(hue - other_hue) <= config.color_difference:
+                small = sizes[number] <= config.piece * sizes[other]
                 gap = float(tree.query(points[own])[0].min())
-                best = min(best, (gap, other))
+                if gap <= config.gap_m * (1.0 if small else 0.5):
+                    best = min(best, (gap, other))
         if best[1] >= 0:
             parts[own] = best[1]
         else:
