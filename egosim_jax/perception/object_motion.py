@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from egosim_jax.geometry import invert, pixels_of, transform
+from egosim_jax.geometry import UP_AXES, Up, invert, pixels_of, transform, up_of
 from egosim_jax.perception.grasps import (
     TIPS,
     couplings,
@@ -34,7 +34,7 @@ from egosim_jax.perception.pose_refinement import (
     refine_pose,
 )
 from egosim_jax.perception.silhouettes import PALM
-from egosim_jax.rendering.portrait import UP_AXES, Up, up_of
+from egosim_jax.state.planes import fit_plane
 from egosim_jax.types import Action, Cameras, Clip, InputError, Kind, SceneState, check_counts
 
 GRAVITY = 9.81
@@ -225,18 +225,11 @@ def _support_plane(
 
     With too few points, return a horizontal plane of unknown height.
     """
-    import open3d as o3d
-    from threadpoolctl import threadpool_limits
-
     distances = np.linalg.norm(others_m - points_m.mean(axis=0), axis=1)
     near = others_m[distances < config.plane_radius_m]
     if len(near) < config.min_points:
         return np.array([*UP_AXES[up], np.nan])
-    o3d.utility.random.seed(0)
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(near))
-    with threadpool_limits(1, user_api="openmp"):  # its threads race, and runs would differ
-        plane, _ = cloud.segment_plane(config.plane_tolerance_m, 3, 500)
-    return np.array(plane)
+    return fit_plane(near, config.plane_tolerance_m)[0]
 
 
 def fall(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"], fps: int) -> ObjectMotion:
