@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from egosim_jax.geometry import invert, pixels_of, transform
+from egosim_jax.perception.extent import predicted_costs
 from egosim_jax.perception.grasps import (
     TIPS,
     couplings,
@@ -25,6 +26,7 @@ from egosim_jax.perception.grasps import (
     is_between,
     palm_motion,
 )
+from egosim_jax.perception.growth import Growth, Surroundings
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.perception.pose_refinement import (
     ColorCost,
@@ -35,6 +37,7 @@ from egosim_jax.perception.pose_refinement import (
 )
 from egosim_jax.perception.silhouettes import PALM
 from egosim_jax.rendering.portrait import UP_AXES, Up, up_of
+from egosim_jax.state.new_objects import next_object_id, with_objects
 from egosim_jax.types import Action, Cameras, Clip, InputError, Kind, SceneState, check_counts
 
 GRAVITY = 9.81
@@ -43,6 +46,8 @@ MIN_LIFT_M = 0.01
 """Minimum height of a release above the first height, in meters; below it nothing falls."""
 FOOTPRINT_M = 0.006
 """Horizontal distance within which the state's points are below an object, in meters."""
+NEW = 0
+"""Number of an object that has no id yet."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +80,10 @@ class TrackObjects:
     """Radius around the object's center in which points determine its plane, in meters."""
     blur_px: float = 0.7
     """Sigma of the Gaussian blur of the clip: generated frames are softer than points."""
+    growth: Growth = field(default_factory=Growth)
+    """Segmentation of an object without an id."""
+    smaller: float = 1.0
+    """Minimum advantage of the next smaller growth of an object, in 8-bit levels."""
     color: ColorCost = field(default_factory=ColorCost)
     """Comparison of the clip's colors with the predicted colors."""
     refinement: Refinement = field(
@@ -97,10 +106,13 @@ class TrackObjects:
             so_far.require(name, "TrackObjects") for name in ("cameras", "joints_m", "object_ids")
         )
         action = replace(action, cameras=cameras, joints_m=joints)
-        moved = estimate_object_motion(clip, action, state, ids < 0, self)
+        moved, new, notes = estimate_object_motion(clip, action, state, ids < 0, self)
         frames = np.arange(len(clip.frames))
         return replace(
             so_far,
+            new_objects=new,
+            names={**(so_far.names or {}), **{number: f"object {number}" for number in new}},
+            notes=(*so_far.notes, *notes),
             motions={m.model.number: m.path for m in moved},
             support_planes={m.model.number: m.model.plane for m in moved},
             interacted_frames={
@@ -115,18 +127,32 @@ def estimate_object_motion(
     state: SceneState,
     hidden: Bool[np.ndarray, "f h w"],
     config: TrackObjects,
-) -> list[ObjectMotion]:
-    """Return the motions of the objects that hands moved, at most one for each hand.
+) -> tuple[list[ObjectMotion], dict[int, Float32[np.ndarray, "n 3"]], list[str]]:
+    """Return the motions of the objects that hands moved, the new objects' points, and notes.
 
-    If two hands claim an object, the hand that explains the colors better gets it. `hidden` marks
-    the pixels that hands cover. A hand that is missing in any frame is ignored.
+    Each hand moves at most one object. If two hands claim an object, the hand that explains the
+    colors better gets it. `hidden` marks the pixels that hands cover. A hand that is missing in any
+    frame is ignored. Without an object with an id in its grip, a hand may move a new one: it gets
+    the next free id.
     """
     shown = _smooth(clip.frames, config.blur_px)
     found: dict[int, tuple[float, ObjectMotion]] = {}
+    new: dict[int, Float32[np.ndarray, "n 3"]] = {}
+    notes: list[str] = []
     for hand in range(action.joints_m.shape[1]):
         joints = action.joints_m[:, hand]
         if np.isfinite(joints).all():
-            best = _best_candidate(joints, action, state, shown, hidden, config)
+            best, note = _best_candidate(joints, action, state, shown, hidden, config)
+            if best is not None and best[1].model.number == NEW:
+                change, motion = best
+                number = next_object_id(state)
+                motion = replace(motion, model=replace(motion.model, number=number))
+                best = change, motion
+                new[number] = motion.model.points_m.astype(np.float32)
+                state = with_objects(state, new)
+                note = f"moved something without an id: it is object {number} now"
+            if note:
+                notes.append(f"hand {hand} {note}")
             if best is not None:
                 change, motion = best
                 others = state.points_m[state.object_ids != motion.model.number]
@@ -137,7 +163,39 @@ def estimate_object_motion(
                 number = motion.model.number
                 if number not in found or change < found[number][0]:
                     found[number] = change, motion
-    return [motion for _, motion in found.values()]
+    return [motion for _, motion in found.values()], new, notes
+
+
+_Candidate = tuple[float, ObjectMotion]
+"""Change of the cost by a motion, less the highest accepted one; and the motion."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Grip:
+    """Movements of one hand, and the times at which it may have held something."""
+
+    palm_m: Float[np.ndarray, "f j 3"]
+    tips_m: Float[np.ndarray, "f t 3"]
+    holds: list[tuple[int, int]]
+    """Frames of the grasp and of the release of each possible hold."""
+    sure: bool
+    """True if the hand surely held something."""
+
+    @classmethod
+    def of(cls, joints_m: Float[np.ndarray, "f j 3"], kind: Kind, config: TrackObjects) -> _Grip:
+        """Return the grip of a hand with these joints."""
+        tips = joints_m[:, TIPS[kind]]
+        holds, sure = find_holds(tips, config.opening_tolerance_m)
+        return cls(palm_m=joints_m[:, PALM[kind]], tips_m=tips, holds=holds, sure=sure)
+
+    @property
+    def grasps(self) -> list[int]:
+        """Frames at which a possible hold begins."""
+        return sorted({grasped for grasped, _ in self.holds})
+
+    def has(self, points_m: Float[np.ndarray, "n 3"], grasped: int, config: TrackObjects) -> bool:
+        """Return True if the hand surely holds the points that are at rest at a grasp."""
+        return self.sure and is_between(points_m, self.tips_m[grasped], config.grip_radius_m)
 
 
 def _best_candidate(
@@ -147,50 +205,95 @@ def _best_candidate(
     shown: Float32[np.ndarray, "f h w 3"],
     hidden: Bool[np.ndarray, "f h w"],
     config: TrackObjects,
-) -> tuple[float, ObjectMotion] | None:
-    """Return the best accepted candidate of one hand, after its change of cost.
+) -> tuple[_Candidate | None, str]:
+    """Return the best accepted candidate of one hand, and a note.
+
+    If the hand holds no object that has an id, it may move one that has none.
+    """
+    grip = _Grip.of(joints_m, action.kind, config)
+    found: list[_Candidate] = []
+    held = False
+    for number in _near_tips(grip.tips_m, state, config):
+        model = object_model(number, state, config)
+        held |= any(grip.has(model.points_m, grasped, config) for grasped in grip.grasps)
+        name = state.names.get(number, "").lower()
+        prior = config.prompt_prior if name and name in action.prompt.lower() else 1.0
+        best = _best_motion(model, grip, prior, action.cameras, shown, hidden, config)
+        found += [best] if best else []
+    note = ""
+    if not held:
+        things, note = _things_without_id(grip, action.cameras, state, config)
+        for growths in things:
+            tried = [
+                _best_motion(model, grip, 1.0, action.cameras, shown, hidden, config)
+                for model in growths
+            ]
+            accepted = [best for best in tried if best]
+            if accepted:
+                costs = predicted_costs(
+                    [motion for _, motion in accepted],
+                    action.cameras,
+                    state,
+                    shown,
+                    hidden,
+                    config.color,
+                )
+                costs = [cost + rank * config.smaller for rank, cost in enumerate(costs)]
+                found.append(accepted[int(np.argmin(costs))])
+        if things and not found and grip.sure:
+            note = "closed on something without an id that the clip shows at rest"
+    return min(found, key=lambda candidate: candidate[0], default=None), note
+
+
+def _best_motion(
+    model: ObjectModel,
+    grip: _Grip,
+    prior: float,
+    cameras: Cameras,
+    shown: Float32[np.ndarray, "f h w 3"],
+    hidden: Bool[np.ndarray, "f h w"],
+    config: TrackObjects,
+) -> _Candidate | None:
+    """Return the best accepted motion of an object with one hand, after its change of cost.
 
     The change is relative to the object at rest, because an object in the table's color costs
     little anywhere. It is 0 if the object is not visible, and lower for an object in the grip.
     """
-    best: tuple[float, ObjectMotion] | None = None
-    palm, tips = joints_m[:, PALM[action.kind]], joints_m[:, TIPS[action.kind]]
-    holds, sure = find_holds(tips, config.opening_tolerance_m)
-    rigid = {grasped: palm_motion(palm, grasped) for grasped in {hold[0] for hold in holds}}
-    hinges = {hold: hinge_motion(tips, hold) for hold in holds}
-    for number in _near_tips(joints_m, action.kind, state, config):
-        model = object_model(number, state, config)
-        name = state.names.get(number, "").lower()
-        prior = config.prompt_prior if name and name in action.prompt.lower() else 1.0
-        still = np.repeat(np.eye(4)[None], len(joints_m), axis=0)
-        rest = _cost(model, still, action.cameras, shown, hidden, config)
-        improvement = max(config.min_improvement, (1 - config.max_cost_ratio) * rest)
-        for hold in holds:
-            gripped = sure and is_between(model.points_m, tips[hold[0]], config.grip_radius_m)
-            max_change = config.grip_evidence if gripped else -improvement
-            loose = couplings(palm, rigid[hold[0]], model.plane[:3], hold)
-            for path in (*loose, hinges[hold]):
-                if path is None:
-                    continue
-                cost = prior * _cost(model, path, action.cameras, shown, hidden, config)
-                known = np.isfinite(cost) and np.isfinite(rest)
-                change = (cost - rest if known else 0.0) - max_change
-                if change < (0.0 if best is None else best[0]):
-                    hinged = path is hinges[hold]
-                    best = (
-                        change,
-                        ObjectMotion(
-                            model=model, grasped=hold[0], released=hold[1], path=path, hinged=hinged
-                        ),
-                    )
+    best: _Candidate | None = None
+    still = np.repeat(np.eye(4)[None], len(shown), axis=0)
+    rest = _cost(model, still, cameras, shown, hidden, config)
+    improvement = max(config.min_improvement, (1 - config.max_cost_ratio) * rest)
+    rigid = {grasped: palm_motion(grip.palm_m, grasped) for grasped in grip.grasps}
+    for hold in grip.holds:
+        gripped = grip.has(model.points_m, hold[0], config)
+        max_change = config.grip_evidence if gripped else -improvement
+        loose = couplings(grip.palm_m, rigid[hold[0]], model.plane[:3], hold)
+        hinge = hinge_motion(grip.tips_m, hold)
+        for path in (*loose, hinge):
+            if path is None:
+                continue
+            cost = prior * _cost(model, path, cameras, shown, hidden, config)
+            known = np.isfinite(cost) and np.isfinite(rest)
+            change = (cost - rest if known else 0.0) - max_change
+            if change < (0.0 if best is None else best[0]):
+                best = (
+                    change,
+                    ObjectMotion(
+                        model=model,
+                        grasped=hold[0],
+                        released=hold[1],
+                        path=path,
+                        hinged=path is hinge,
+                    ),
+                )
     return best
 
 
 def _near_tips(
-    joints_m: Float[np.ndarray, "f j 3"], kind: Kind, state: SceneState, config: TrackObjects
+    tips_m: Float[np.ndarray, "f t 3"], state: SceneState, config: TrackObjects
 ) -> list[int]:
     """Return the ids of the objects near a fingertip."""
-    tips = joints_m[:, TIPS[kind]].reshape(-1, 3)
+    tips = tips_m.reshape(-1, 3)
     near = []
     for number in np.unique(state.object_ids[state.object_ids > 0]).tolist():
         points = state.points_m[state.object_ids == number]
@@ -200,6 +303,45 @@ def _near_tips(
             if gaps.min() <= config.reach_m:
                 near.append(number)
     return near
+
+
+def _things_without_id(
+    grip: _Grip, cameras: Cameras, state: SceneState, config: TrackObjects
+) -> tuple[list[list[ObjectModel]], str]:
+    """Return the growths of each thing without an id that the hand touches, and a note.
+
+    The note says why a hand that surely held something has no growth.
+    """
+    free = np.flatnonzero(state.object_ids == 0)
+    pinches = grip.tips_m[grip.grasps].mean(axis=1)
+    gaps = [np.linalg.norm(state.points_m[free] - p, axis=1) for p in pinches]
+    free = free[np.min(gaps, axis=0) <= config.growth.max_extent_m]
+    points = state.points_m[free]
+    if len(points) < config.min_points:
+        return [], "closed on nothing" if grip.sure else ""
+    plane = _support_plane(pinches, points, config, up=up_of(state))
+    eye = cameras.world_from_camera[0, :3, 3]
+    around = Surroundings(
+        points_m=points,
+        colors=state.colors[free].astype(np.float32),
+        plane=-plane if eye @ plane[:3] + plane[3] < 0 else plane,
+        eye_m=eye,
+        config=config.growth,
+    )
+    things, note = around.touched([grip.tips_m[frame] for frame in grip.grasps])
+    models = [
+        [
+            ObjectModel(
+                number=NEW,
+                points_m=points[members].astype(float),
+                colors=around.colors[members],
+                plane=around.plane,
+            )
+            for members in growths
+        ]
+        for growths in things
+    ]
+    return models, note if grip.sure else ""
 
 
 def object_model(number: int, state: SceneState, config: TrackObjects) -> ObjectModel:
