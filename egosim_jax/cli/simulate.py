@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from egosim_jax.data.sheet import SheetClip, draw_sheet
+from egosim_jax.geometry import up_of
 from egosim_jax.rendering import RendererName
-from egosim_jax.rendering.portrait import up_of, write_portrait
+from egosim_jax.rendering.portrait import write_portrait
 from egosim_jax.rendering.rerun_log import RECORDING, Recording
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.runtime.terminal import printable

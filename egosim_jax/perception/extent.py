@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 
 from egosim_jax.geometry import cameras_in_object_frame
 from egosim_jax.perception.pose_refinement import ColorCost, ObjectMotion
@@ -21,10 +21,30 @@ from egosim_jax.types import Cameras, SceneState
 
 FRAMES = 5
 """Number of compared frames, from the grasp to the end."""
+ADVANTAGE = 1.0
+"""Minimum advantage of each smaller growth, in 8-bit levels."""
 MARGIN_M = 0.05
 """Distance around the moved points within which the state is drawn, in meters."""
 POINT_PX = 2
 """Size of the drawn points in pixels."""
+
+
+def choose_extent(
+    motions: Sequence[ObjectMotion],
+    cameras: Cameras,
+    state: SceneState,
+    shown: Float32[np.ndarray, "f h w 3"],
+    hidden: Bool[np.ndarray, "f h w"],
+    color: ColorCost,
+) -> int:
+    """Return the index of the motion whose growth explains the clip best, the largest first.
+
+    A smaller growth must explain it better than the one before by a margin.
+    """
+    if len(motions) == 1:
+        return 0
+    costs = predicted_costs(motions, cameras, state, shown, hidden, color)
+    return int(np.argmin(costs + ADVANTAGE * np.arange(len(costs))))
 
 
 def predicted_costs(
@@ -34,7 +54,7 @@ def predicted_costs(
     shown: Float32[np.ndarray, "f h w 3"],
     hidden: Bool[np.ndarray, "f h w"],
     color: ColorCost,
-) -> list[float]:
+) -> Float[np.ndarray, " m"]:
     """Return how far the scene that each motion predicts is from the clip, in 8-bit levels."""
     frames = _compared_frames(motions)
     local = replace(cameras, world_from_camera=cameras.world_from_camera[frames])
@@ -53,7 +73,7 @@ def predicted_costs(
         nearer = (moved >= 0) & (moved_m < rest_m)
         drawn = np.where(nearer[..., None], motion.model.colors[moved], drawn)
         costs.append(color.mean(shown[compared], drawn[compared]) if compared.any() else 0.0)
-    return costs
+    return np.array(costs)
 
 
 def _compared_frames(motions: Sequence[ObjectMotion]) -> Int[np.ndarray, " g"]:

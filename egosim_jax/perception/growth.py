@@ -15,6 +15,14 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
+from egosim_jax.geometry import UP_AXES, up_of
+from egosim_jax.perception.grasps import Grip
+from egosim_jax.perception.pose_refinement import ObjectModel
+from egosim_jax.state.planes import support_planes
+from egosim_jax.types import Cameras, SceneState
+
+NEW = 0
+"""Number of an object that has no id yet."""
 NEIGHBORS = 16
 """Number of nearest points that determine a point's normal and its edges."""
 MIN_PLANE_M = 0.002
@@ -240,6 +248,44 @@ class Surroundings:
         own = np.median(self.colors[seeds], axis=0)
         light = (self.colors @ own) / max(float(own @ own), 1.0)
         return np.linalg.norm(self.colors - light[:, None] * own, axis=1) < self.config.color_levels
+
+
+def things_without_id(
+    grip: Grip, cameras: Cameras, state: SceneState, config: Growth
+) -> tuple[list[list[ObjectModel]], str]:
+    """Return the growths of each thing without an id that a hand touches, and a note.
+
+    The note says why a hand that surely held something has no growth.
+    """
+    pinches = grip.tips_m[grip.grasps].mean(axis=1)
+    free = np.flatnonzero(state.object_ids == 0)
+    gaps = [np.linalg.norm(state.points_m[free] - pinch, axis=1) for pinch in pinches]
+    free = free[np.min(gaps, axis=0) <= config.max_extent_m]
+    if len(free) < config.min_points:
+        return [], "closed on nothing" if grip.sure else ""
+    points, eye = state.points_m[free], cameras.world_from_camera[0, :3, 3]
+    surfaces = support_planes(points, np.array(UP_AXES[up_of(state)]))
+    around = Surroundings(
+        points_m=points,
+        colors=state.colors[free].astype(np.float32),
+        plane=surfaces[0].plane if surfaces else np.array([*UP_AXES[up_of(state)], np.nan]),
+        eye_m=eye,
+        config=config,
+    )
+    found, note = around.touched([grip.tips_m[frame] for frame in grip.grasps])
+    things = [
+        [
+            ObjectModel(
+                number=NEW,
+                points_m=points[members].astype(float),
+                colors=around.colors[members],
+                plane=around.plane,
+            )
+            for members in growths
+        ]
+        for growths in found
+    ]
+    return things, note if grip.sure else ""
 
 
 def seeds_between(

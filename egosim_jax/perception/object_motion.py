@@ -16,17 +16,10 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from egosim_jax.geometry import invert, pixels_of, transform
-from egosim_jax.perception.extent import predicted_costs
-from egosim_jax.perception.grasps import (
-    TIPS,
-    couplings,
-    find_holds,
-    hinge_motion,
-    is_between,
-    palm_motion,
-)
-from egosim_jax.perception.growth import Growth, Surroundings
+from egosim_jax.geometry import UP_AXES, Up, invert, pixels_of, transform, up_of
+from egosim_jax.perception.extent import choose_extent
+from egosim_jax.perception.grasps import Grip, couplings, hinge_motion, palm_motion
+from egosim_jax.perception.growth import NEW, Growth, things_without_id
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.perception.pose_refinement import (
     ColorCost,
@@ -35,10 +28,9 @@ from egosim_jax.perception.pose_refinement import (
     Refinement,
     refine_pose,
 )
-from egosim_jax.perception.silhouettes import PALM
-from egosim_jax.rendering.portrait import UP_AXES, Up, up_of
 from egosim_jax.state.new_objects import next_object_id, with_objects
-from egosim_jax.types import Action, Cameras, Clip, InputError, Kind, SceneState, check_counts
+from egosim_jax.state.planes import fit_plane
+from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState, check_counts
 
 GRAVITY = 9.81
 """Acceleration of a fall in m/s^2."""
@@ -46,8 +38,6 @@ MIN_LIFT_M = 0.01
 """Minimum height of a release above the first height, in meters; below it nothing falls."""
 FOOTPRINT_M = 0.006
 """Horizontal distance within which the state's points are below an object, in meters."""
-NEW = 0
-"""Number of an object that has no id yet."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,8 +72,6 @@ class TrackObjects:
     """Sigma of the Gaussian blur of the clip: generated frames are softer than points."""
     growth: Growth = field(default_factory=Growth)
     """Segmentation of an object without an id."""
-    smaller: float = 1.0
-    """Minimum advantage of the next smaller growth of an object, in 8-bit levels."""
     color: ColorCost = field(default_factory=ColorCost)
     """Comparison of the clip's colors with the predicted colors."""
     refinement: Refinement = field(
@@ -170,34 +158,6 @@ _Candidate = tuple[float, ObjectMotion]
 """Change of the cost by a motion, less the highest accepted one; and the motion."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Grip:
-    """Movements of one hand, and the times at which it may have held something."""
-
-    palm_m: Float[np.ndarray, "f j 3"]
-    tips_m: Float[np.ndarray, "f t 3"]
-    holds: list[tuple[int, int]]
-    """Frames of the grasp and of the release of each possible hold."""
-    sure: bool
-    """True if the hand surely held something."""
-
-    @classmethod
-    def of(cls, joints_m: Float[np.ndarray, "f j 3"], kind: Kind, config: TrackObjects) -> _Grip:
-        """Return the grip of a hand with these joints."""
-        tips = joints_m[:, TIPS[kind]]
-        holds, sure = find_holds(tips, config.opening_tolerance_m)
-        return cls(palm_m=joints_m[:, PALM[kind]], tips_m=tips, holds=holds, sure=sure)
-
-    @property
-    def grasps(self) -> list[int]:
-        """Frames at which a possible hold begins."""
-        return sorted({grasped for grasped, _ in self.holds})
-
-    def has(self, points_m: Float[np.ndarray, "n 3"], grasped: int, config: TrackObjects) -> bool:
-        """Return True if the hand surely holds the points that are at rest at a grasp."""
-        return self.sure and is_between(points_m, self.tips_m[grasped], config.grip_radius_m)
-
-
 def _best_candidate(
     joints_m: Float[np.ndarray, "f j 3"],
     action: Action,
@@ -210,44 +170,40 @@ def _best_candidate(
 
     If the hand holds no object that has an id, it may move one that has none.
     """
-    grip = _Grip.of(joints_m, action.kind, config)
+    grip = Grip.of(
+        joints_m, action.kind, tolerance_m=config.opening_tolerance_m, radius_m=config.grip_radius_m
+    )
     found: list[_Candidate] = []
     held = False
     for number in _near_tips(grip.tips_m, state, config):
         model = object_model(number, state, config)
-        held |= any(grip.has(model.points_m, grasped, config) for grasped in grip.grasps)
+        held |= any(grip.has(model.points_m, grasped) for grasped in grip.grasps)
         name = state.names.get(number, "").lower()
         prior = config.prompt_prior if name and name in action.prompt.lower() else 1.0
         best = _best_motion(model, grip, prior, action.cameras, shown, hidden, config)
         found += [best] if best else []
-    note = ""
-    if not held:
-        things, note = _things_without_id(grip, action.cameras, state, config)
-        for growths in things:
-            tried = [
-                _best_motion(model, grip, 1.0, action.cameras, shown, hidden, config)
-                for model in growths
-            ]
-            accepted = [best for best in tried if best]
-            if accepted:
-                costs = predicted_costs(
-                    [motion for _, motion in accepted],
-                    action.cameras,
-                    state,
-                    shown,
-                    hidden,
-                    config.color,
-                )
-                costs = [cost + rank * config.smaller for rank, cost in enumerate(costs)]
-                found.append(accepted[int(np.argmin(costs))])
-        if things and not found and grip.sure:
-            note = "closed on something without an id that the clip shows at rest"
+    if held:
+        return min(found, key=lambda candidate: candidate[0], default=None), ""
+    things, note = things_without_id(grip, action.cameras, state, config.growth)
+    for growths in things:
+        moved = [
+            _best_motion(model, grip, 1.0, action.cameras, shown, hidden, config)
+            for model in growths
+        ]
+        moved = [best for best in moved if best is not None]
+        if moved:
+            motions = [motion for _, motion in moved]
+            found.append(
+                moved[choose_extent(motions, action.cameras, state, shown, hidden, config.color)]
+            )
+    if things and grip.sure and not found:
+        note = "closed on something without an id that the clip shows at rest"
     return min(found, key=lambda candidate: candidate[0], default=None), note
 
 
 def _best_motion(
     model: ObjectModel,
-    grip: _Grip,
+    grip: Grip,
     prior: float,
     cameras: Cameras,
     shown: Float32[np.ndarray, "f h w 3"],
@@ -265,7 +221,7 @@ def _best_motion(
     improvement = max(config.min_improvement, (1 - config.max_cost_ratio) * rest)
     rigid = {grasped: palm_motion(grip.palm_m, grasped) for grasped in grip.grasps}
     for hold in grip.holds:
-        gripped = grip.has(model.points_m, hold[0], config)
+        gripped = grip.has(model.points_m, hold[0])
         max_change = config.grip_evidence if gripped else -improvement
         loose = couplings(grip.palm_m, rigid[hold[0]], model.plane[:3], hold)
         hinge = hinge_motion(grip.tips_m, hold)
@@ -305,45 +261,6 @@ def _near_tips(
     return near
 
 
-def _things_without_id(
-    grip: _Grip, cameras: Cameras, state: SceneState, config: TrackObjects
-) -> tuple[list[list[ObjectModel]], str]:
-    """Return the growths of each thing without an id that the hand touches, and a note.
-
-    The note says why a hand that surely held something has no growth.
-    """
-    free = np.flatnonzero(state.object_ids == 0)
-    pinches = grip.tips_m[grip.grasps].mean(axis=1)
-    gaps = [np.linalg.norm(state.points_m[free] - p, axis=1) for p in pinches]
-    free = free[np.min(gaps, axis=0) <= config.growth.max_extent_m]
-    points = state.points_m[free]
-    if len(points) < config.min_points:
-        return [], "closed on nothing" if grip.sure else ""
-    plane = _support_plane(pinches, points, config, up=up_of(state))
-    eye = cameras.world_from_camera[0, :3, 3]
-    around = Surroundings(
-        points_m=points,
-        colors=state.colors[free].astype(np.float32),
-        plane=-plane if eye @ plane[:3] + plane[3] < 0 else plane,
-        eye_m=eye,
-        config=config.growth,
-    )
-    things, note = around.touched([grip.tips_m[frame] for frame in grip.grasps])
-    models = [
-        [
-            ObjectModel(
-                number=NEW,
-                points_m=points[members].astype(float),
-                colors=around.colors[members],
-                plane=around.plane,
-            )
-            for members in growths
-        ]
-        for growths in things
-    ]
-    return models, note if grip.sure else ""
-
-
 def object_model(number: int, state: SceneState, config: TrackObjects) -> ObjectModel:
     """Return the model of an object. Its plane is horizontal if no surface is around it."""
     own = state.object_ids == number
@@ -367,18 +284,11 @@ def _support_plane(
 
     With too few points, return a horizontal plane of unknown height.
     """
-    import open3d as o3d
-    from threadpoolctl import threadpool_limits
-
     distances = np.linalg.norm(others_m - points_m.mean(axis=0), axis=1)
     near = others_m[distances < config.plane_radius_m]
     if len(near) < config.min_points:
         return np.array([*UP_AXES[up], np.nan])
-    o3d.utility.random.seed(0)
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(near))
-    with threadpool_limits(1, user_api="openmp"):  # its threads race, and runs would differ
-        plane, _ = cloud.segment_plane(config.plane_tolerance_m, 3, 500)
-    return np.array(plane)
+    return fit_plane(near, config.plane_tolerance_m)[0]
 
 
 def fall(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"], fps: int) -> ObjectMotion:
