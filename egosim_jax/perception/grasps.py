@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -61,6 +62,16 @@ class Grip:
     def grasps(self) -> list[int]:
         """Frames at which a possible hold begins."""
         return sorted({grasped for grasped, _ in self.holds})
+
+    @cached_property
+    def rigid(self) -> dict[int, Float[np.ndarray, "f 4 4"]]:
+        """Motion of the palm since each grasp."""
+        return {grasped: palm_motion(self.palm_m, grasped) for grasped in self.grasps}
+
+    @cached_property
+    def hinges(self) -> dict[tuple[int, int], Float[np.ndarray, "f 4 4"] | None]:
+        """Motion about a hinge in each hold; None where there is none."""
+        return {hold: hinge_motion(self.tips_m, hold) for hold in self.holds}
 
     def has(self, points_m: Float[np.ndarray, "n 3"], grasped: int) -> bool:
         """Return True if the hand surely holds an object that has these points at a grasp."""

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from egosim_jax.geometry import UP_AXES, Up, invert, pixels_of, transform, up_of
 from egosim_jax.perception.extent import choose_extent
-from egosim_jax.perception.grasps import Grip, couplings, hinge_motion, palm_motion
+from egosim_jax.perception.grasps import Grip, couplings
 from egosim_jax.perception.growth import NEW, Growth, things_without_id
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.perception.pose_refinement import (
@@ -219,12 +219,11 @@ def _best_motion(
     still = np.repeat(np.eye(4)[None], len(shown), axis=0)
     rest = _cost(model, still, cameras, shown, hidden, config)
     improvement = max(config.min_improvement, (1 - config.max_cost_ratio) * rest)
-    rigid = {grasped: palm_motion(grip.palm_m, grasped) for grasped in grip.grasps}
     for hold in grip.holds:
         gripped = grip.has(model.points_m, hold[0])
         max_change = config.grip_evidence if gripped else -improvement
-        loose = couplings(grip.palm_m, rigid[hold[0]], model.plane[:3], hold)
-        hinge = hinge_motion(grip.tips_m, hold)
+        loose = couplings(grip.palm_m, grip.rigid[hold[0]], model.plane[:3], hold)
+        hinge = grip.hinges[hold]
         for path in (*loose, hinge):
             if path is None:
                 continue
