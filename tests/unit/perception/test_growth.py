@@ -13,9 +13,9 @@ from egosim_jax.types import Cameras, SceneState
 RED, BLUE, WOOD = (200, 30, 30), (30, 40, 190), (150, 140, 120)
 STEP_M = 0.004
 CAMERA = Cameras(
-    world_from_camera=np.array(
-        [[[1, 0, 0, 0], [0, -0.6, 0.8, -0.5], [0, -0.8, -0.6, 0.6], [0, 0, 0, 1]]]
-    ),
+    world_from_camera=look_at(np.array([0, -0.5, 0.6]), np.zeros(3), up=np.array([0, 0, 1.0]))[
+        None
+    ],
     intrinsics_px=np.array([[277.0, 0, 159.5], [0, 277, 95.5], [0, 0, 1]]),
     height=192,
     width=320,
