@@ -157,7 +157,7 @@ class Surroundings:
                 continue
             growths = list(self.grow(seeds))
             things[part] = [
-                self.skirt(members)
+                self.with_feet(self.with_crumbs(members))
                 for members in growths
                 if self.extent_m(members) <= self.config.max_extent_m
             ]
@@ -194,7 +194,26 @@ class Surroundings:
         """Return the longest side of the box around some points in meters."""
         return float(np.ptp(self.points_m[members], axis=0).max())
 
-    def skirt(self, members: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    def with_crumbs(self, members: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+        """Return an object's points with the pieces beside it that are too small for an object.
+
+        Such pieces are a seam along its edge, whose points mix two colors, or single points.
+        """
+        from scipy.spatial import KDTree
+
+        parts = self.parts(self.raised & ~members)
+        (rest,) = np.nonzero(parts >= 0)
+        if not len(rest):
+            return members
+        gaps = KDTree(self.points_m[members]).query(self.points_m[rest])[0]
+        near = gaps <= 1.5 * self.radius_m
+        count, close = (np.bincount(parts[rest], weights) for weights in (None, near))
+        piece = (close > 0) & ((count < self.config.min_points) | (close >= 0.9 * count))
+        grown = members.copy()
+        grown[rest] = piece[parts[rest]]
+        return grown
+
+    def with_feet(self, members: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """Return an object's points with its lowest ones, which are near the plane.
 
         They are next to the object, and look like it or stand upright as the plane does not.
