@@ -4,8 +4,9 @@ A grasped object moves with the hand. A candidate combines an object near a fing
 of a possible hold, and a motion of the hand that the object may follow (`grasps`). Its cost is the
 mean difference between the object's colors and the clip's colors where the object would be visible.
 The candidate that most improves on the object at rest is accepted. An object between the closing
-fingertips counts as moved unless the clip clearly shows it at rest. A released object falls
-(`fall`), and `pose_refinement` refines its last pose.
+fingertips counts as moved unless the clip clearly shows it at rest. If they hold nothing with an
+id, candidates are grown from the points between them (`growth`), and `extent` chooses how far. A
+released object falls (`fall`), and `pose_refinement` refines its last pose.
 """
 
 from __future__ import annotations
