@@ -25,6 +25,8 @@ NEW = 0
 """Number of an object that has no id yet."""
 NEIGHBORS = 16
 """Number of nearest points that determine a point's normal and its edges."""
+MAX_SEEDS = 20
+"""Maximum number of points between the fingertips that give an object's color."""
 MIN_HEIGHT_M = 0.002
 """Minimum height above the supporting plane at which a point is not on it, in meters."""
 MAX_NOISE_M = 0.006
@@ -188,11 +190,14 @@ class Surroundings:
     ) -> Iterator[Bool[np.ndarray, " n"]]:
         """Yield the points of the possible objects around seeds in a part, the largest first."""
         flat = whole & ~self.hollow
-        convex = self._fill(self._around(seeds, self.parts(flat)), whole)
-        alike = self._alike(seeds)
         one, other = self.pairs.T
-        bent = (self.normals[one] * self.normals[other]).sum(axis=1)
-        sharp = bent < np.cos(np.radians(self.config.edge_deg))
+        bend = self.normals[one] - self.normals[other]
+        steps = self.points_m[other] - self.points_m[one]
+        rise = (bend * steps).sum(axis=1) / 2
+        concave = rise > self.config.concave * np.linalg.norm(steps, axis=1)
+        sharp = np.linalg.norm(bend, axis=1) > np.radians(self.config.edge_deg)
+        convex = self._fill(self._around(seeds, self.parts(flat, concave)), whole)
+        alike = self._alike(seeds)
         found: list[Bool[np.ndarray, " n"]] = []
         for members in (
             whole,
@@ -281,7 +286,7 @@ class Surroundings:
 
     def _alike(self, seeds: Int[np.ndarray, " s"]) -> Bool[np.ndarray, " n"]:
         """Return the points in the color of the seeds under any light."""
-        own = np.median(self.colors[seeds], axis=0)
+        own = np.median(self.colors[seeds[:MAX_SEEDS]], axis=0)
         light = (self.colors @ own) / max(float(own @ own), 1.0)
         return np.linalg.norm(self.colors - light[:, None] * own, axis=1) < self.config.color_levels
 
@@ -308,7 +313,7 @@ def things_without_id(
 def seeds_between(
     points_m: Float[np.ndarray, "n 3"], tips_m: Float[np.ndarray, "j 3"], reach_m: float
 ) -> Int[np.ndarray, " s"]:
-    """Return the points nearest to the line from the thumb to the fingers.
+    """Return the points nearest to the line from the thumb to the fingers, from its middle.
 
     Points within 5 mm more than the nearest one's distance count; none beyond `reach_m`.
     """
@@ -319,4 +324,5 @@ def seeds_between(
     nearest = float(away.min(initial=np.inf))
     if nearest > reach_m:
         return np.zeros(0, int)
-    return np.flatnonzero(away <= nearest + 0.005)
+    seeds = np.flatnonzero(away <= nearest + 0.005)
+    return seeds[np.argsort(np.abs(share[seeds] - 0.5), kind="stable")]
