@@ -9,8 +9,10 @@ Cameras and hand joints are the generator's inputs. The stages then run in this 
 Depth is set only where the clip differs from the view of the previous state. Elsewhere depth is
 unknown, and the state does not change.
 
-Limits: each object must be a separate instance in the state, and so must the moving part of an
-articulated object. One hand at a time moves an object, and objects do not topple.
+A hand that closes on something without an id makes it a new object (`growth`), if the clip shows
+that it moves with the hand.
+
+Limits: one hand at a time moves an object, and objects do not topple.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ from egosim_jax.types import Action, Cameras, Clip, SceneState, check_counts
 
 
 def take_action(clip: Clip, action: Action, state: SceneState, so_far: Observation) -> Observation:
-    """Set cameras and hand joints to the generator's inputs, and no new names."""
+    """Set cameras and hand joints to the generator's inputs, and no names yet."""
     return replace(so_far, cameras=action.cameras, joints_m=action.joints_m, names={})
 
 
