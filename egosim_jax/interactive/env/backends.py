@@ -24,6 +24,11 @@ class Backend(Protocol):
         """Length, size and rate of the clips."""
         ...
 
+    @property
+    def trained_on(self) -> str | None:
+        """Simulated world whose clips trained the model; None if unknown or without a model."""
+        ...
+
     needs_past: ClassVar[bool]
     """True if a simulator depends on all actions since the seed."""
 
@@ -50,6 +55,8 @@ class GeneratedWorld:
     """Length, size and rate of the generator's clips."""
     perception: str | None = "classical"
     """Perception that updates the state: name and options, or None to keep the first state."""
+    trained_on: str | None = None
+    """Simulated world whose clips trained the generator (`configs.trained_on`); None if unknown."""
 
     needs_past: ClassVar[bool] = False
 
