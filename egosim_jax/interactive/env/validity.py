@@ -1,14 +1,14 @@
 """Agreement of generated frames with the state, where no hand acts.
 
 A model may repaint the background, or fade an object that no hand touches. Both are compared with
-the view of the state before the clip. Pixels near hands and arms are left out.
+the view of the state before the clip. Pixels near hands and arms are skipped.
 """
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from egosim_jax.perception.silhouettes import HandShape, hand_silhouette
 from egosim_jax.rendering import Renderer
@@ -17,8 +17,13 @@ from egosim_jax.types import Action, SceneState, View
 
 MAX_LEVELS = 25
 """Maximum color difference (0 to 255) of a pixel that agrees with the state."""
-HAND_MARGIN = 0.08
-"""Margin around a hand's skeleton in which pixels may change, as a fraction of the image width."""
+SKELETON_MARGIN, ARM_MARGIN = 0.08, 0.02
+"""Margins around skeletons, for the background, and around hands with flesh and forearms, for
+objects, as fractions of the image width: pixels within may change."""
+BLUR = 0.01
+"""Radius of the blur in which objects are compared, as a fraction of the image width.
+
+Generated frames are softer than points: stripes would disagree without it."""
 TOUCH_M = 0.05
 """Distance from a joint to the box around an object within which a hand may touch it, in meters."""
 MIN_OBJECT_PIXELS = 100
@@ -31,28 +36,26 @@ def validity(state: SceneState, step: Step, action: Action, renderer: Renderer) 
     `validity` is of the background. `object_validity` is of the object that agrees least, of those
     that no hand touches; `state` is the state before the step. Each is NaN without such pixels.
     """
-    view = step.view
-    gaps = np.abs(step.clip.frames.astype(np.int16) - view.frames).max(axis=-1)
-    agrees = gaps <= MAX_LEVELS
+    view, frames = step.view, step.clip.frames
     skeletons = renderer.draw_hands(action.joints_m, action.cameras, kind=action.kind)[1]
-    hands = np.isfinite(skeletons)
-    background = agrees[steady_pixels(view, hands)]
+    steady = _agree(frames, view.frames)[steady_pixels(view, np.isfinite(skeletons))]
     arms = hand_silhouette(action.joints_m, action.kind, action.cameras, HandShape()) >= 0
-    seen = (view.mask == 0) & ~_near(hands | arms)
+    seen = (view.mask == 0) & ~_widen(arms, ARM_MARGIN)
+    agree = _agree(_blur(frames), _blur(view.frames))
     shares = []
     for number in untouched(state, step.state, action.joints_m):
-        pixels = seen & _inner(view.object_ids == number)
+        pixels = seen & _without_outline(view.object_ids == number)
         if np.count_nonzero(pixels) >= MIN_OBJECT_PIXELS:
-            shares.append(float(agrees[pixels].mean()))
+            shares.append(float(agree[pixels].mean()))
     return {
-        "validity": float(background.mean()) if background.size else float("nan"),
+        "validity": float(steady.mean()) if steady.size else float("nan"),
         "object_validity": min(shares, default=float("nan")),
     }
 
 
 def steady_pixels(view: View, hands: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
     """Return the mask of background pixels of a view in which nothing should move."""
-    return (view.mask == 0) & ~_near((view.object_ids != 0) | hands)
+    return (view.mask == 0) & ~_widen((view.object_ids != 0) | hands, SKELETON_MARGIN)
 
 
 def untouched(
@@ -75,14 +78,27 @@ def _is_near(joints_m: Float[np.ndarray, "k 3"], points_m: Float[np.ndarray, "m 
     return bool(((joints_m >= low) & (joints_m <= high)).all(axis=1).any())
 
 
-def _near(hands: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
-    """Return the pixels within `HAND_MARGIN` of a mask."""
-    reach = 2 * round(HAND_MARGIN * hands.shape[2]) + 1
-    square = np.ones((reach, reach), np.uint8)
-    return np.stack([cv2.dilate(mask.astype(np.uint8), square) for mask in hands]) > 0
+def _agree(
+    frames: UInt8[np.ndarray, "f h w 3"], view: UInt8[np.ndarray, "f h w 3"]
+) -> Bool[np.ndarray, "f h w"]:
+    return np.abs(frames.astype(np.int16) - view).max(axis=-1) <= MAX_LEVELS
 
 
-def _inner(pixels: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
-    """Return an object's pixels without its outline, which generated frames blur."""
+def _blur(frames: UInt8[np.ndarray, "f h w 3"]) -> UInt8[np.ndarray, "f h w 3"]:
+    size = _size(frames.shape[2], BLUR)
+    return np.stack([cv2.blur(frame, (size, size)) for frame in frames])
+
+
+def _widen(masks: Bool[np.ndarray, "f h w"], margin: float) -> Bool[np.ndarray, "f h w"]:
+    square = np.ones((_size(masks.shape[2], margin),) * 2, np.uint8)
+    return np.stack([cv2.dilate(mask.astype(np.uint8), square) for mask in masks]) > 0
+
+
+def _without_outline(masks: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
     square = np.ones((3, 3), np.uint8)
-    return np.stack([cv2.erode(mask.astype(np.uint8), square) for mask in pixels]) > 0
+    return np.stack([cv2.erode(mask.astype(np.uint8), square) for mask in masks]) > 0
+
+
+def _size(width: int, fraction: float) -> int:
+    """Return the side of a square in pixels, around a center, from a fraction of the width."""
+    return 2 * round(fraction * width) + 1
