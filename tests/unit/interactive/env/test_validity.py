@@ -84,7 +84,7 @@ def test_another_background_lowers_only_its_own_figure():
 
 
 def test_softer_frames_of_an_object_agree_with_the_state():
-    frames = np.stack([cv2.blur(frame, (5, 5)) for frame in view().frames])
+    frames = np.stack([cv2.blur(frame, (3, 3)) for frame in view().frames])
     assert measured(frames)["object_validity"] == 1.0
 
 
