@@ -88,15 +88,21 @@ class GeneratedWorld:
 
 
 def tabletop_start(seed: int, spec: ActionSpec, video: VideoSpec) -> Start:
-    """Return the start of a seed's tabletop scene."""
+    """Return the start of a seed's tabletop scene, with the neutral prompt."""
     check_seed(seed, name="seed")
     _, camera, first, state = start_of_sequence(seed, spec=video, kind=spec.kind)
-    name = next(iter(state.names.values()))
-    who = "The gripper" if spec.kind == "robot" else f"The {spec.sides[0]} hand"
     return Start(
         state=state,
         camera=camera,
-        prompt=f"{who} picks up the {name} and puts it down to the left.",
+        prompt=neutral_prompt(spec),
         seed=seed,
         first_frame=first.colors,
     )
+
+
+def neutral_prompt(spec: ActionSpec) -> str:
+    """Return a prompt that names no object and no goal: the policy alone decides what happens."""
+    who = "gripper" if spec.kind == "robot" else "hand"
+    if len(spec.sides) > 1:
+        return f"The {who}s move."
+    return "The gripper moves." if spec.kind == "robot" else f"The {spec.sides[0]} hand moves."

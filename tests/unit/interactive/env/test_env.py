@@ -169,10 +169,15 @@ def test_infos_of_a_vector_environment_have_the_figures_and_poses_of_each_episod
         assert infos[name].dtype == float
 
 
-def test_an_unknown_act_has_a_prompt_that_names_no_object():
-    for spec in (ActionSpec(), ActionSpec(layout="gripper"), ActionSpec(sides=("left",))):
-        start = painted().start(3, spec)
-        assert not any(name in start.prompt for name in start.state.names.values())
+def test_the_default_prompt_names_no_object():
+    for fields, prompt in (
+        ({}, "The right hand moves."),
+        ({"sides": ("left",)}, "The left hand moves."),
+        ({"sides": ("right", "left")}, "The hands move."),
+        ({"layout": "gripper"}, "The gripper moves."),
+        ({"layout": "gripper", "sides": ("right", "left")}, "The grippers move."),
+    ):
+        assert painted().start(3, ActionSpec(**fields)).prompt == prompt
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
