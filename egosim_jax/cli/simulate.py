@@ -122,6 +122,9 @@ class Simulate:
             file=sys.stderr,
             flush=True,
         )
+        made_on = configs.trained_on(self.config, weights)
+        if note := configs.scene_warning(made_on, episode.state.provenance):
+            print(note, file=sys.stderr, flush=True)
         simulator = Simulator(
             generator=Generator.load(config, weights, renderer=rendering.get(self.renderer)),
             perception=perception,

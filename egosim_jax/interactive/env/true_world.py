@@ -43,6 +43,7 @@ class TrueWorld:
     """Backend that executes actions in the tabletop world and returns its ground truth."""
 
     needs_past: ClassVar[bool] = True
+    trained_on: ClassVar[str | None] = None
     video: VideoSpec
     """Length, size and rate of the clips."""
     _changing: threading.Lock = field(
