@@ -1,4 +1,4 @@
-"""Last stages of an annotation: metric scale, first frame without hands, scene state, caption."""
+"""Last stages of an annotation: scale, moved objects, first frame without hands, state, caption."""
 
 from __future__ import annotations
 
@@ -31,6 +31,8 @@ from egosim_jax.rendering.reference import splat
 from egosim_jax.state.depth import state_from_depth
 from egosim_jax.types import SceneState, Triplet
 
+MOVED = "moved object"
+"""Name of an object that a hand moves, if no network names it."""
 PLATE_MARGIN = 1 / 80
 """Width of the border around hands that is replaced, too, as a fraction of the image width."""
 FRAMES_AT_ONCE = 64
@@ -84,13 +86,43 @@ def _sparse_depth(record: Record) -> DepthEstimate:
     )
 
 
+def find_moved_objects(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
+    """Add `moved_ids`, and their pixels and names: the objects that hands move in the clip.
+
+    An object that a network segmented keeps its id. A sleeve counts as an arm.
+    """
+    from egosim_jax.perception.moved import find_moved
+
+    ids, names = record.require("object_ids").copy(), dict(record.names or {})
+    found = []
+    if record.hands is not None and visible(record.hands).any():
+        depth_m = record.require("depth").depth_m[0]
+        found = find_moved(record.frames, record.moving, record.hands, record.cameras, depth_m)
+    numbers: list[int] = []
+    for moved in found:
+        known, count = np.unique(ids[0][moved.first], return_counts=True)
+        number = int(known[count.argmax()])
+        if moved.worn:
+            number = -1
+        elif number <= 0:
+            number = max(int(ids.max()), *names, 0) + 1
+            names[number] = MOVED if MOVED not in names.values() else f"{MOVED} {number}"
+        ids[moved.shown & (ids == 0)] = number
+        numbers += [number] * (number > 0)
+    notes = {"moved": {number: int((ids[0] == number).sum()) for number in numbers}}
+    moved_ids = np.array(numbers, np.int32)
+    return record.add("objects", notes, object_ids=ids, names=names, moved_ids=moved_ids)
+
+
 def clean_first_frame(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
     """Add `first_frame`: hands and arms are replaced from other frames, or inpainted."""
     from egosim_jax.perception.plate import clean_plate
 
     depth_m = record.require("depth").depth_m[0]
     margin = max(2, round(PLATE_MARGIN * record.plan.width))
-    plate = clean_plate(record.frames, record.moving, record.cameras, depth_m, margin_px=margin)
+    plate = clean_plate(
+        record.frames, record.moving, record.cameras, depth_m, moved=record.moved, margin_px=margin
+    )
     notes = {
         "hand_px": int(record.moving[0].sum()),
         "seen_px": int(plate.seen.sum()),
@@ -130,7 +162,8 @@ def extend_state(
     here = replace(record.cameras, world_from_camera=pose[None])
     # Slightly larger points than in the prior close the gaps between the points of a surface.
     seen, _ = splat(state.points_m, here, point_px=POINT_PX + 1)
-    hidden = cv2.dilate(record.moving[frame].astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    hidden = (record.moving[frame] | record.moved[frame]).astype(np.uint8)
+    hidden = cv2.dilate(hidden, np.ones((7, 7), np.uint8)) > 0
     new = ~np.isfinite(seen[0]) & ~hidden & np.isfinite(depth_m)
     rays = pixel_rays(here.intrinsics_px, height=here.height, width=here.width)[new]
     points = transform(pose, rays * depth_m[new][:, None]).astype(np.float32)
@@ -146,7 +179,8 @@ def extend_state(
 
 def add_caption(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
     """Add `prompt`: given, recorded, written by a network, or made by a rule."""
-    names = sorted(set((record.names or {}).values()) | set(record.recording.names))
+    named = {name for name in (record.names or {}).values() if not name.startswith(MOVED)}
+    names = sorted(named | set(record.recording.names))
     if config.caption_text is not None:
         prompt, source = config.caption_text, "--caption"
     elif record.recording.caption and estimators.captioner is None:
@@ -193,7 +227,8 @@ def to_triplet(record: Record, config: AnnotateConfig) -> tuple[Triplet, dict[st
             "rung": record.require("estimate").verdict.rung,
         },
     )
-    judged = drawn & ~record.moving  # not the mask: its observed region is wider than the points
+    # Not the mask: its observed region is wider than the points.
+    judged = drawn & ~record.moving & ~record.moved
     judged[0] = False
     first = np.broadcast_to(record.frames[0], record.frames.shape)
     return triplet, {
@@ -267,6 +302,7 @@ STAGES = (
     Stage("lens", undistort_clip),
     Stage("depth", find_depth, ("depth",)),
     Stage("scale", find_scale),
+    Stage("objects", find_moved_objects, ("object_ids", "names", "moved_ids")),
     Stage("plate", clean_first_frame, ("first_frame",)),
     Stage("scene", build_state),
     Stage("caption", add_caption, ("prompt",)),
