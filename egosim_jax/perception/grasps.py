@@ -9,12 +9,15 @@ motion of the palm. A lid or door turns about the axis of the fingertips' arc (`
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float
 
 from egosim_jax.geometry import hinge_rotation, umeyama
+from egosim_jax.perception.silhouettes import PALM
 from egosim_jax.types import Kind
 
 TIPS: dict[Kind, list[int]] = {"human": [4, 8, 12], "robot": [1, 2]}
@@ -25,6 +28,54 @@ MIN_ARC_DEG = 25.0
 """Minimum angle of an arc, in degrees; a shorter arc does not determine its axis."""
 MAX_ARC_ERROR = 0.05
 """Maximum distance of the fingertips from an arc, as a fraction of its radius."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grip:
+    """Joints of one hand, and the times at which it may have held an object."""
+
+    palm_m: Float[np.ndarray, "f j 3"]
+    tips_m: Float[np.ndarray, "f t 3"]
+    holds: list[tuple[int, int]]
+    """Frames of the grasp and of the release of each possible hold."""
+    sure: bool
+    """True if the hand surely held something."""
+    radius_m: float
+    """Maximum distance of a gripped point from the line between the fingertips, in meters."""
+
+    @classmethod
+    def of(
+        cls,
+        joints_m: Float[np.ndarray, "f j 3"],
+        kind: Kind,
+        *,
+        tolerance_m: float,
+        radius_m: float,
+    ) -> Grip:
+        """Return the grip of a hand whose opening changes by at most a tolerance in a hold."""
+        tips = joints_m[:, TIPS[kind]]
+        holds, sure = find_holds(tips, tolerance_m)
+        palm = joints_m[:, PALM[kind]]
+        return cls(palm_m=palm, tips_m=tips, holds=holds, sure=sure, radius_m=radius_m)
+
+    @property
+    def grasps(self) -> list[int]:
+        """Frames at which a possible hold begins."""
+        return sorted({grasped for grasped, _ in self.holds})
+
+    @cached_property
+    def rigid(self) -> dict[int, Float[np.ndarray, "f 4 4"]]:
+        """Motion of the palm since each grasp."""
+        return {grasped: palm_motion(self.palm_m, grasped) for grasped in self.grasps}
+
+    @cached_property
+    def hinges(self) -> dict[tuple[int, int], Float[np.ndarray, "f 4 4"] | None]:
+        """Motion about a hinge in each hold; None where there is none."""
+        return {hold: hinge_motion(self.tips_m, hold) for hold in self.holds}
+
+    def has(self, points_m: Float[np.ndarray, "n 3"], grasped: int) -> bool:
+        """Return True if the hand surely holds an object that has these points at a grasp."""
+        return self.sure and is_between(points_m, self.tips_m[grasped], self.radius_m)
 
 
 def find_holds(

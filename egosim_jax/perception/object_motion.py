@@ -16,15 +16,10 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from egosim_jax.geometry import invert, pixels_of, transform
-from egosim_jax.perception.grasps import (
-    TIPS,
-    couplings,
-    find_holds,
-    hinge_motion,
-    is_between,
-    palm_motion,
-)
+from egosim_jax.geometry import UP_AXES, Up, invert, pixels_of, transform, up_of
+from egosim_jax.perception.extent import choose_extent
+from egosim_jax.perception.grasps import Grip, couplings
+from egosim_jax.perception.growth import NEW, Growth, things_without_id
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.perception.pose_refinement import (
     ColorCost,
@@ -33,9 +28,9 @@ from egosim_jax.perception.pose_refinement import (
     Refinement,
     refine_pose,
 )
-from egosim_jax.perception.silhouettes import PALM
-from egosim_jax.rendering.portrait import UP_AXES, Up, up_of
-from egosim_jax.types import Action, Cameras, Clip, InputError, Kind, SceneState, check_counts
+from egosim_jax.state.new_objects import next_object_id, with_objects
+from egosim_jax.state.planes import fit_plane
+from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState, check_counts
 
 GRAVITY = 9.81
 """Acceleration of a fall in m/s^2."""
@@ -75,6 +70,8 @@ class TrackObjects:
     """Radius around the object's center in which points determine its plane, in meters."""
     blur_px: float = 0.7
     """Sigma of the Gaussian blur of the clip: generated frames are softer than points."""
+    growth: Growth = field(default_factory=Growth)
+    """Segmentation of an object without an id."""
     color: ColorCost = field(default_factory=ColorCost)
     """Comparison of the clip's colors with the predicted colors."""
     refinement: Refinement = field(
@@ -97,10 +94,13 @@ class TrackObjects:
             so_far.require(name, "TrackObjects") for name in ("cameras", "joints_m", "object_ids")
         )
         action = replace(action, cameras=cameras, joints_m=joints)
-        moved = estimate_object_motion(clip, action, state, ids < 0, self)
+        moved, new, notes = estimate_object_motion(clip, action, state, ids < 0, self)
         frames = np.arange(len(clip.frames))
         return replace(
             so_far,
+            new_objects=new,
+            names={**(so_far.names or {}), **{number: f"object {number}" for number in new}},
+            notes=(*so_far.notes, *notes),
             motions={m.model.number: m.path for m in moved},
             support_planes={m.model.number: m.model.plane for m in moved},
             interacted_frames={
@@ -115,18 +115,32 @@ def estimate_object_motion(
     state: SceneState,
     hidden: Bool[np.ndarray, "f h w"],
     config: TrackObjects,
-) -> list[ObjectMotion]:
-    """Return the motions of the objects that hands moved, at most one for each hand.
+) -> tuple[list[ObjectMotion], dict[int, Float32[np.ndarray, "n 3"]], list[str]]:
+    """Return the motions of the objects that hands moved, the new objects' points, and notes.
 
-    If two hands claim an object, the hand that explains the colors better gets it. `hidden` marks
-    the pixels that hands cover. A hand that is missing in any frame is ignored.
+    Each hand moves at most one object. If two hands claim an object, the hand that explains the
+    colors better gets it. `hidden` marks the pixels that hands cover. A hand that is missing in any
+    frame is ignored. Without an object with an id in its grip, a hand may move a new one: it gets
+    the next free id.
     """
     shown = _smooth(clip.frames, config.blur_px)
     found: dict[int, tuple[float, ObjectMotion]] = {}
+    new: dict[int, Float32[np.ndarray, "n 3"]] = {}
+    notes: list[str] = []
     for hand in range(action.joints_m.shape[1]):
         joints = action.joints_m[:, hand]
         if np.isfinite(joints).all():
-            best = _best_candidate(joints, action, state, shown, hidden, config)
+            best, note = _best_candidate(joints, action, state, shown, hidden, config)
+            if best is not None and best[1].model.number == NEW:
+                change, motion = best
+                number = next_object_id(state)
+                motion = replace(motion, model=replace(motion.model, number=number))
+                best = change, motion
+                new[number] = motion.model.points_m.astype(np.float32)
+                state = with_objects(state, new)
+                note = f"moved something without an id: it is object {number} now"
+            if note:
+                notes.append(f"hand {hand} {note}")
             if best is not None:
                 change, motion = best
                 others = state.points_m[state.object_ids != motion.model.number]
@@ -137,7 +151,11 @@ def estimate_object_motion(
                 number = motion.model.number
                 if number not in found or change < found[number][0]:
                     found[number] = change, motion
-    return [motion for _, motion in found.values()]
+    return [motion for _, motion in found.values()], new, notes
+
+
+_Candidate = tuple[float, ObjectMotion]
+"""Change of the cost by a motion, less the highest accepted one; and the motion."""
 
 
 def _best_candidate(
@@ -147,50 +165,90 @@ def _best_candidate(
     shown: Float32[np.ndarray, "f h w 3"],
     hidden: Bool[np.ndarray, "f h w"],
     config: TrackObjects,
-) -> tuple[float, ObjectMotion] | None:
-    """Return the best accepted candidate of one hand, after its change of cost.
+) -> tuple[_Candidate | None, str]:
+    """Return the best accepted candidate of one hand, and a note.
+
+    If the hand holds no object that has an id, it may move one that has none.
+    """
+    grip = Grip.of(
+        joints_m, action.kind, tolerance_m=config.opening_tolerance_m, radius_m=config.grip_radius_m
+    )
+    found: list[_Candidate] = []
+    held = False
+    for number in _near_tips(grip.tips_m, state, config):
+        model = object_model(number, state, config)
+        held |= any(grip.has(model.points_m, grasped) for grasped in grip.grasps)
+        name = state.names.get(number, "").lower()
+        prior = config.prompt_prior if name and name in action.prompt.lower() else 1.0
+        best = _best_motion(model, grip, prior, action.cameras, shown, hidden, config)
+        found += [best] if best else []
+    if held:
+        return min(found, key=lambda candidate: candidate[0], default=None), ""
+    things, note = things_without_id(grip, action.cameras, state, config.growth)
+    for growths in things:
+        moved = [
+            _best_motion(model, grip, 1.0, action.cameras, shown, hidden, config)
+            for model in growths
+        ]
+        moved = [best for best in moved if best is not None]
+        if moved:
+            motions = [motion for _, motion in moved]
+            found.append(
+                moved[choose_extent(motions, action.cameras, state, shown, hidden, config.color)]
+            )
+    if things and grip.sure and not found:
+        note = "closed on something without an id that the clip shows at rest"
+    return min(found, key=lambda candidate: candidate[0], default=None), note
+
+
+def _best_motion(
+    model: ObjectModel,
+    grip: Grip,
+    prior: float,
+    cameras: Cameras,
+    shown: Float32[np.ndarray, "f h w 3"],
+    hidden: Bool[np.ndarray, "f h w"],
+    config: TrackObjects,
+) -> _Candidate | None:
+    """Return the best accepted motion of an object with one hand, after its change of cost.
 
     The change is relative to the object at rest, because an object in the table's color costs
     little anywhere. It is 0 if the object is not visible, and lower for an object in the grip.
     """
-    best: tuple[float, ObjectMotion] | None = None
-    palm, tips = joints_m[:, PALM[action.kind]], joints_m[:, TIPS[action.kind]]
-    holds, sure = find_holds(tips, config.opening_tolerance_m)
-    rigid = {grasped: palm_motion(palm, grasped) for grasped in {hold[0] for hold in holds}}
-    hinges = {hold: hinge_motion(tips, hold) for hold in holds}
-    for number in _near_tips(joints_m, action.kind, state, config):
-        model = object_model(number, state, config)
-        name = state.names.get(number, "").lower()
-        prior = config.prompt_prior if name and name in action.prompt.lower() else 1.0
-        still = np.repeat(np.eye(4)[None], len(joints_m), axis=0)
-        rest = _cost(model, still, action.cameras, shown, hidden, config)
-        improvement = max(config.min_improvement, (1 - config.max_cost_ratio) * rest)
-        for hold in holds:
-            gripped = sure and is_between(model.points_m, tips[hold[0]], config.grip_radius_m)
-            max_change = config.grip_evidence if gripped else -improvement
-            loose = couplings(palm, rigid[hold[0]], model.plane[:3], hold)
-            for path in (*loose, hinges[hold]):
-                if path is None:
-                    continue
-                cost = prior * _cost(model, path, action.cameras, shown, hidden, config)
-                known = np.isfinite(cost) and np.isfinite(rest)
-                change = (cost - rest if known else 0.0) - max_change
-                if change < (0.0 if best is None else best[0]):
-                    hinged = path is hinges[hold]
-                    best = (
-                        change,
-                        ObjectMotion(
-                            model=model, grasped=hold[0], released=hold[1], path=path, hinged=hinged
-                        ),
-                    )
+    best: _Candidate | None = None
+    still = np.repeat(np.eye(4)[None], len(shown), axis=0)
+    rest = _cost(model, still, cameras, shown, hidden, config)
+    improvement = max(config.min_improvement, (1 - config.max_cost_ratio) * rest)
+    for hold in grip.holds:
+        gripped = grip.has(model.points_m, hold[0])
+        max_change = config.grip_evidence if gripped else -improvement
+        loose = couplings(grip.palm_m, grip.rigid[hold[0]], model.plane[:3], hold)
+        hinge = grip.hinges[hold]
+        for path in (*loose, hinge):
+            if path is None:
+                continue
+            cost = prior * _cost(model, path, cameras, shown, hidden, config)
+            known = np.isfinite(cost) and np.isfinite(rest)
+            change = (cost - rest if known else 0.0) - max_change
+            if change < (0.0 if best is None else best[0]):
+                best = (
+                    change,
+                    ObjectMotion(
+                        model=model,
+                        grasped=hold[0],
+                        released=hold[1],
+                        path=path,
+                        hinged=path is hinge,
+                    ),
+                )
     return best
 
 
 def _near_tips(
-    joints_m: Float[np.ndarray, "f j 3"], kind: Kind, state: SceneState, config: TrackObjects
+    tips_m: Float[np.ndarray, "f t 3"], state: SceneState, config: TrackObjects
 ) -> list[int]:
     """Return the ids of the objects near a fingertip."""
-    tips = joints_m[:, TIPS[kind]].reshape(-1, 3)
+    tips = tips_m.reshape(-1, 3)
     near = []
     for number in np.unique(state.object_ids[state.object_ids > 0]).tolist():
         points = state.points_m[state.object_ids == number]
@@ -225,18 +283,11 @@ def _support_plane(
 
     With too few points, return a horizontal plane of unknown height.
     """
-    import open3d as o3d
-    from threadpoolctl import threadpool_limits
-
     distances = np.linalg.norm(others_m - points_m.mean(axis=0), axis=1)
     near = others_m[distances < config.plane_radius_m]
     if len(near) < config.min_points:
         return np.array([*UP_AXES[up], np.nan])
-    o3d.utility.random.seed(0)
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(near))
-    with threadpool_limits(1, user_api="openmp"):  # its threads race, and runs would differ
-        plane, _ = cloud.segment_plane(config.plane_tolerance_m, 3, 500)
-    return np.array(plane)
+    return fit_plane(near, config.plane_tolerance_m)[0]
 
 
 def fall(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"], fps: int) -> ObjectMotion:

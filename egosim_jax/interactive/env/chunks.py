@@ -113,13 +113,13 @@ def timed_step(
         rendered = time.monotonic()
         clip = simulator.generate(view, action, seed=seed, first_frame=first_frame)
     generated = time.monotonic()
-    after = simulator.update(state, clip, action)
+    after, notes = simulator.update(state, clip, action)
     timing = Timing(
         render_s=rendered - then,
         generate_s=generated - rendered,
         update_s=time.monotonic() - generated,
     )
-    return Step(view=view, clip=clip, state=after), timing
+    return Step(view=view, clip=clip, state=after, notes=notes), timing
 
 
 def view_of(simulator: Simulator, state: SceneState, cameras: Cameras) -> View:

@@ -177,6 +177,7 @@ class RunningEpisode:
         return step, {
             **chunk.info(self.actions),
             "validity": validity(step, action, simulator.renderer),
+            "notes": list(step.notes),
             "timing": timing,
         }
 

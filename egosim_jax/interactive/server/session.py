@@ -291,6 +291,7 @@ class Session:
             "padded_frames": request["padded_frames"],
             "hidden_hands": request["hidden_hands"],
             "validity": validity(step, action, simulator.renderer),
+            "notes": list(step.notes),
         }
         row = np.array(request["rows"][-1], float)
         write_json(folder / INFO, info)

@@ -11,6 +11,7 @@ from egosim_jax.perception.classical import ClassicalConfig, HandMasks
 from egosim_jax.perception.oracle import OracleConfig
 from egosim_jax.perception.silhouettes import hand_silhouette
 from egosim_jax.state.fuse import fuse
+from egosim_jax.state.new_objects import is_among
 from egosim_jax.types import Clip, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_action, to_ground_truth
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND
@@ -57,6 +58,38 @@ def test_a_blurred_object_ends_where_the_hand_put_it(clip, sigma_px):
     true = clip.world_from_body[clip.target]
     gap = (found[-1] @ invert(found[0]) - true[-1] @ invert(true[0])) @ true[0][:, 3]
     assert np.linalg.norm(gap) < 0.01
+
+
+@pytest.fixture(scope="module")
+def without_ids(clip):
+    state = clip.state
+    bare = replace(state, object_ids=np.zeros_like(state.object_ids), names={})
+    found = ClassicalConfig().build()(Clip(frames=clip.frames, fps=8), to_action(clip), bare)
+    return bare, found
+
+
+def test_an_object_without_an_id_is_found_and_moved(clip, without_ids):
+    bare, found = without_ids
+    target = clip.state.points_m[clip.state.object_ids == clip.body_ids[clip.target]]
+    assert found.names == {1: "object 1"}
+    assert found.notes == ("hand 0 moved something without an id: it is object 1 now",)
+    (points,) = found.new_objects.values()
+    assert is_among(target, points).mean() > 0.95
+    assert is_among(points, target).mean() > 0.95
+    after = fuse(bare, found)
+    path = clip.world_from_body[clip.target]
+    there = transform(path[-1] @ invert(path[0]), target.astype(float))
+    own = after.points_m[after.object_ids == 1]
+    gaps = np.linalg.norm(own[:, None] - there[None], axis=-1).min(axis=1)
+    assert np.percentile(gaps, 95) < 0.01
+    assert is_among(target, after.points_m).mean() < 0.02
+
+
+def test_in_the_next_clip_the_object_keeps_its_id(clip, without_ids):
+    after = fuse(*without_ids)
+    again = ClassicalConfig().build()(Clip(frames=clip.frames, fps=8), to_action(clip), after)
+    assert again.new_objects == {}
+    assert set(again.world_from_object) <= {1}
 
 
 def test_the_table_under_a_moved_object_is_revealed(clip, found):

@@ -1,0 +1,121 @@
+"""Choice between growths of a moved object by the whole scene that each one predicts.
+
+A growth with half the object leaves the other half behind, and one with a part of the table takes
+it along. Both look wrong where the object was and where it went. So all growths are compared over
+the same pixels: those that the object of any growth covers, before or after the move.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from egosim_jax.geometry import cameras_in_object_frame
+from egosim_jax.perception.pose_refinement import ColorCost, ObjectMotion
+from egosim_jax.rendering.reference import splat
+from egosim_jax.state.new_objects import is_among
+from egosim_jax.types import Cameras, SceneState
+
+FRAMES = 5
+"""Number of compared frames, from the grasp to the end."""
+ADVANTAGE = 1.0
+"""Minimum advantage of each smaller growth, in 8-bit levels."""
+MARGIN_M = 0.05
+"""Distance around the moved points within which the state is drawn, in meters."""
+POINT_PX = 2
+"""Size of the drawn points in pixels."""
+
+
+def choose_extent(
+    motions: Sequence[ObjectMotion],
+    cameras: Cameras,
+    state: SceneState,
+    shown: Float32[np.ndarray, "f h w 3"],
+    hidden: Bool[np.ndarray, "f h w"],
+    color: ColorCost,
+) -> int:
+    """Return the index of the motion whose growth explains the clip best, the largest first.
+
+    A smaller growth must explain it better than the one before by a margin.
+    """
+    if len(motions) == 1:
+        return 0
+    costs = predicted_costs(motions, cameras, state, shown, hidden, color)
+    return int(np.argmin(costs + ADVANTAGE * np.arange(len(costs))))
+
+
+def predicted_costs(
+    motions: Sequence[ObjectMotion],
+    cameras: Cameras,
+    state: SceneState,
+    shown: Float32[np.ndarray, "f h w 3"],
+    hidden: Bool[np.ndarray, "f h w"],
+    color: ColorCost,
+) -> Float[np.ndarray, " m"]:
+    """Return how far the scene that each motion predicts is from the clip, in 8-bit levels."""
+    frames = _compared_frames(motions)
+    local = replace(cameras, world_from_camera=cameras.world_from_camera[frames])
+    shown, hidden = shown[frames], hidden[frames]
+    near = _near(motions, state)
+    points, colors = state.points_m[near], state.colors[near].astype(np.float32)
+    ground = _ground_color(motions[0], points, colors)
+    layers = [_draw(motion, frames, local, points) for motion in motions]
+    compared = np.any([layer[1] >= 0 for layer in layers], axis=0)
+    everything = np.concatenate([m.model.points_m for m in motions]).astype(np.float32)
+    compared |= splat(everything, local, point_px=POINT_PX)[1] >= 0
+    compared &= ~hidden
+    costs = []
+    for motion, (moved_m, moved, rest_m, rest) in zip(motions, layers, strict=True):
+        drawn = np.append(colors, ground[None], axis=0)[rest]
+        nearer = (moved >= 0) & (moved_m < rest_m)
+        drawn = np.where(nearer[..., None], motion.model.colors[moved], drawn)
+        costs.append(color.mean(shown[compared], drawn[compared]) if compared.any() else 0.0)
+    return np.array(costs)
+
+
+def _compared_frames(motions: Sequence[ObjectMotion]) -> Int[np.ndarray, " g"]:
+    first = min(motion.grasped for motion in motions)
+    last = len(motions[0].path) - 1
+    return np.unique(np.rint(np.linspace(first, last, FRAMES + 1)[1:]).astype(int))
+
+
+def _near(motions: Sequence[ObjectMotion], state: SceneState) -> Bool[np.ndarray, " n"]:
+    """Return the state's points in the box of the moved points, widened by a margin."""
+    places = np.concatenate(
+        [
+            motion.model.points_m @ pose[:3, :3].T + pose[:3, 3]
+            for motion in motions
+            for pose in motion.path[[0, motion.released, -1]]
+        ]
+    )
+    low, high = places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M
+    return ((state.points_m >= low) & (state.points_m <= high)).all(axis=1)
+
+
+def _ground_color(
+    motion: ObjectMotion, points_m: Float32[np.ndarray, "n 3"], colors: Float32[np.ndarray, "n 3"]
+) -> Float32[np.ndarray, " 3"]:
+    """Return the color of the supporting plane; NaN without points on it."""
+    plane = motion.model.plane
+    on = np.abs(points_m @ plane[:3] + plane[3]) < 0.005
+    if not on.any():
+        return np.full(3, np.nan, np.float32)
+    return np.median(colors[on], axis=0).astype(np.float32)
+
+
+def _draw(
+    motion: ObjectMotion,
+    frames: Int[np.ndarray, " g"],
+    cameras: Cameras,
+    points_m: Float32[np.ndarray, "n 3"],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return depth and index of the moved object, and of the points that it leaves behind."""
+    model = motion.model
+    local = cameras_in_object_frame(cameras, motion.path[frames])
+    moved_m, moved = splat(model.points_m, local, point_px=POINT_PX)
+    left = np.flatnonzero(~is_among(points_m, model.points_m.astype(np.float32)))
+    rest_m, rest = splat(points_m[left], cameras, point_px=POINT_PX)
+    return moved_m, moved, rest_m, np.append(left, len(points_m))[rest]
