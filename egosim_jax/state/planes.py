@@ -88,7 +88,7 @@ def support_planes(
         on = rest[inliers]
         rest = np.delete(rest, inliers)
         angle = np.degrees(np.arccos(np.clip(plane[:3] @ upward, -1, 1)))
-        if angle > max_angle or (found and _area(points_m[on], plane) < MIN_AREA_M2):
+        if angle > max_angle or (found and area_of(points_m[on], plane) < MIN_AREA_M2):
             continue
         upward, max_angle = (plane[:3], PARALLEL_DEG) if not found else (upward, max_angle)
         heights = points_m @ plane[:3] + plane[3]
@@ -98,7 +98,7 @@ def support_planes(
     return found
 
 
-def _area(points_m: Float[np.ndarray, "n 3"], plane: Float[np.ndarray, " 4"]) -> float:
+def area_of(points_m: Float[np.ndarray, "n 3"], plane: Float[np.ndarray, " 4"]) -> float:
     """Return the area that the points cover on the plane, in cells of 2 cm."""
     cell = 0.02
     side = np.linalg.svd(plane[None, :3])[2][1:]
