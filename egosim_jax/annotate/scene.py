@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Int32, UInt8
 
 from egosim_jax.annotate.config import AnnotateConfig, Estimators
 from egosim_jax.annotate.prepare import RefusedError
@@ -29,6 +29,7 @@ from egosim_jax.perception.estimates import DepthEstimate, Rung
 from egosim_jax.rendering import POINT_PX
 from egosim_jax.rendering.reference import splat
 from egosim_jax.state.depth import state_from_depth
+from egosim_jax.state.instances import find_objects
 from egosim_jax.types import SceneState, Triplet
 
 MOVED = "moved object"
@@ -135,21 +136,48 @@ def build_state(record: Record, estimators: Estimators, config: AnnotateConfig) 
     """Add `state`, the scene of the prior, from the first frame or also from key frames."""
     from egosim_jax.perception.depth import points_per_pixel
 
-    cameras, ids, depth = record.cameras, record.object_ids, record.require("depth")
-    objects = None if ids is None else np.maximum(ids[0], 0)
+    cameras, depth = record.cameras, record.require("depth")
+    ids, names = np.maximum(record.require("object_ids")[0], 0), dict(record.names or {})
+    if estimators.segmenter is None and depth.confident[0].any():  # not on an assumed plane
+        standing = find_objects(
+            record.require("first_frame"), depth.depth_m[0], cameras.intrinsics_px
+        )
+        ids, names = join_objects(ids, names, standing)
     state = state_from_depth(
         record.require("first_frame"),
         depth.depth_m[0],
         cameras.intrinsics_px,
         cameras.world_from_camera[0],
-        object_ids=objects,
-        names=record.names,
+        object_ids=ids,
+        names=names,
         points_per_pixel=points_per_pixel(depth.depth_m[0], cameras),
     )
     for frame, depth_m in zip(depth.frames[1:], depth.depth_m[1:], strict=True):
         state = extend_state(state, record, int(frame), depth_m)
     state = replace(state, provenance={"source": "video", "video_id": record.video_id})
-    return record.add("scene", {"state": config.state, "points": len(state.points_m)}, state=state)
+    notes = {"state": config.state, "points": len(state.points_m), "objects": names}
+    return record.add("scene", notes, state=state)
+
+
+def join_objects(
+    ids: Int32[np.ndarray, "h w"], names: Mapping[int, str], standing: Int32[np.ndarray, "h w"]
+) -> tuple[Int32[np.ndarray, "h w"], dict[int, str]]:
+    """Return ids and names of the objects that hands move, joined by the others that stand.
+
+    An object whose pixels are mostly on a moved one is part of it.
+    """
+    joined, named = ids.copy(), dict(names)
+    for number in range(1, int(standing.max()) + 1):
+        own = standing == number
+        known = np.unique(ids[own & (ids > 0)], return_counts=True)
+        shared = int(known[1].max(initial=0))
+        if own.any() and 2 * shared > own.sum():
+            new = int(known[0][known[1].argmax()])
+        else:
+            new = max(int(joined.max()), *named, 0) + 1
+            named[new] = f"object {new}"
+        joined[own & (joined == 0)] = new
+    return joined, named
 
 
 def extend_state(

@@ -260,9 +260,9 @@ def _follow_object(
         tracked = np.isfinite(places[frame]).all(axis=1)
         good, there = good | tracked, np.where(good[:, None], there, places[frame])
         found, _ = _similarity(start[good], there[good])
-        motion[frame] = (
-            _carried(motion[frame - 1], start, hands, frame) if found is None else found
-        )
+        if found is None:
+            found = _carried(motion[frame - 1], start, hands, frame)
+        motion[frame] = found
     return motion
 
 
@@ -351,9 +351,7 @@ def _cleaned(
     return _filled(_at_corners(own, start))
 
 
-def _compared(
-    start: Float32[np.ndarray, "n 2"], motion: Float[np.ndarray, "f 2 3"]
-) -> list[int]:
+def _compared(start: Float32[np.ndarray, "n 2"], motion: Float[np.ndarray, "f 2 3"]) -> list[int]:
     """Return frames to compare: half with the object far from its first place."""
     shift = np.linalg.norm(np.stack([_move(m, start) for m in motion]) - start, axis=-1).mean(1)
     far = np.flatnonzero(shift >= min(0.5 * shift.max(), np.ptp(start, axis=0).max()))
@@ -420,4 +418,3 @@ def _touches_border(mask: Bool[np.ndarray, "h w"]) -> bool:
     edge = np.concatenate([mask[:3].ravel(), mask[-3:].ravel(), mask[:, :3].ravel(),
                            mask[:, -3:].ravel()])  # fmt: skip
     return bool(edge.any())
-

@@ -1,6 +1,5 @@
 """Objects that a hand moves in a video of a painted box."""
 
-import cv2
 import numpy as np
 import pytest
 
