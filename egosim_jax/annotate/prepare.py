@@ -65,20 +65,20 @@ class Quality:
 
     def check(self, figures: Mapping[str, float]) -> None:
         """Raise `RefusedError` for the first rule that a clip breaks."""
-        for rule, name, bad, option in (
-            ("black", "black", figures["black"] > self.max_black, "--max-black"),
-            ("blur", "sharpness", figures["sharpness"] < self.min_sharpness, "--min-sharpness"),
-            ("still", "motion", figures["motion"] < self.min_motion, "--min-motion"),
-            ("shaken", "camera_motion", figures["camera_motion"] > self.max_motion, "--max-motion"),
+        for rule, name, sign, option, fix in (
+            ("black", "black", 1, "--max-black", "Annotate the other parts, or allow it"),
+            ("blur", "sharpness", -1, "--min-sharpness", "Take a sharper video, or allow it"),
+            ("still", "motion", -1, "--min-motion", "Annotate parts with motion, or allow it"),
+            ("shaken", "camera_motion", 1, "--max-motion", "Annotate calmer parts, or allow it"),
         ):
-            if bad:
-                limit = getattr(self, option[2:].replace("-", "_"))
+            limit = getattr(self, option[2:].replace("-", "_"))
+            if sign * figures[name] > sign * limit:
                 raise RefusedError(
                     rule,
                     f"{rule}: {name} is {unlike(figures[name], limit)}, beyond {limit:g}. "
-                    f"({option})",
+                    f"{fix}. ({option})",
                     figures,
-                )  # fmt: skip
+                )
 
 
 @dataclass(frozen=True, kw_only=True)

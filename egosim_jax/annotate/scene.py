@@ -25,6 +25,7 @@ from egosim_jax.annotate.stages import (
 )
 from egosim_jax.evaluation.metrics.image import decibels
 from egosim_jax.geometry import invert, pixel_rays, pixels_of, transform
+from egosim_jax.io.bounded import unlike
 from egosim_jax.perception.estimates import DepthEstimate, Rung
 from egosim_jax.rendering import POINT_PX
 from egosim_jax.rendering.reference import splat
@@ -34,6 +35,10 @@ from egosim_jax.types import SceneState, Triplet
 
 MOVED = "moved object"
 """Name of an object that a hand moves, if no network names it."""
+MIN_FIXED_DB = 16.0
+"""Minimum PSNR of the background if the camera stays in its place, in decibels."""
+GOOD_DB = 35.0
+"""PSNR above which the background of a camera that stays in its place need not improve."""
 PLATE_MARGIN = 1 / 80
 """Width of the border around hands that is replaced, too, as a fraction of the image width."""
 FRAMES_AT_ONCE = 64
@@ -309,16 +314,28 @@ def _psnr(
 
 
 def check_prior(rung: Rung, figures: Mapping[str, float], config: AnnotateConfig) -> None:
-    """Raise `RefusedError` if the prior shows the background worse than the first frame does."""
-    if rung in ("static", "rotation"):  # the prior is the first frame itself, at most turned
-        return
-    gain = figures["psnr_background"] - figures["psnr_first_frame"]
+    """Raise `RefusedError` if the prior shows the background worse than the first frame does.
+
+    A camera that stays or turns in its place must also show the first frame's background again.
+    """
+    fixed = rung in ("static", "rotation")  # the prior is the first frame itself, at most turned
+    shown, first = figures["psnr_background"], figures["psnr_first_frame"]
+    gain = shown - (min(first, GOOD_DB) if fixed else first)
     limit = config.cutting.quality.min_prior_gain_db
     if gain < limit:
         raise RefusedError(
             "prior",
             f"prior: the PSNR of the background is {gain:+.1f} dB relative to the repeated first "
             f"frame, below {limit:+.1f} dB. Cameras or depth are wrong. (--min-prior-gain)",
+            figures,
+        )
+    if fixed and shown < MIN_FIXED_DB and np.isfinite(limit):
+        raise RefusedError(
+            "prior",
+            f"prior: the PSNR of the background is {unlike(shown, MIN_FIXED_DB, '.1f')} dB, below "
+            f"{MIN_FIXED_DB:g} dB: the camera seems fixed ({rung}), but the scene changes, as in a "
+            "recording of a screen. Choose another camera method (--rung), annotate other parts "
+            "(--clips), or allow it by --min-prior-gain=-inf. (--min-prior-gain)",
             figures,
         )
 

@@ -91,7 +91,8 @@ def find_hands(record: Record, estimators: Estimators, config: AnnotateConfig) -
         raise RefusedError(
             "hands",
             f"hands: visible in {shown} of {len(seen)} frames, less than "
-            f"{limit:.0%}. (--min-hands)",
+            f"{limit:.0%}. Annotate the parts that show hands (--clips), or allow fewer. "
+            "(--min-hands)",
             {"visible": share},
         )
     _check_sides(hands, seen, config.side)
