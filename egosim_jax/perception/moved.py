@@ -153,26 +153,19 @@ def _with_hands(
         joints = hands.joints_px[:, side]
         found = np.isfinite(joints).all(axis=(1, 2))
         for corner in np.flatnonzero(left.any(axis=0)):
-            place, moves = tracks.places[:, corner], found & left[:, corner]
+            place = tracks.places[:, corner]
             shown = np.flatnonzero(found & np.isfinite(place[:, 0]))
-            if not moves.any() or len(shown) < 3:
-                continue
             apart = np.linalg.norm(joints[shown] - place[shown, None], axis=-1).min(axis=1)
             near = shown[apart <= MAX_HAND_DISTANCE * size[shown, side]]
-            if len(near) < 3:
+            if not left[near, corner].any():
                 continue
-            offset = place[near] - tracks.resting[near, corner]
-            distance = np.linalg.norm(offset, axis=1)
-            low, high = near[distance.argmin()], near[distance.argmax()]
-            if low == high:
-                continue
-            own = offset[distance.argmax()] - offset[distance.argmin()]
-            palm = joints[[low, high]][:, PALM].mean(axis=1)
-            of_hand = palm[1] - palm[0]
-            length = np.linalg.norm(of_hand)
-            held[corner] |= bool(
-                length > 0 and np.linalg.norm(own - of_hand) <= MAX_HAND_DIFFERENCE * length
-            )
+            offset = place - tracks.resting[:, corner]
+            away = near[np.linalg.norm(offset[near], axis=1).argmax()]
+            grasped = max(near[(near < away) & ~left[near, corner]], default=near[0])
+            palm = joints[[grasped, away]][:, PALM].mean(axis=1)
+            of_hand, own = palm[1] - palm[0], offset[away] - offset[grasped]
+            difference = np.linalg.norm(own - of_hand)
+            held[corner] |= bool(difference < MAX_HAND_DIFFERENCE * np.linalg.norm(of_hand))
     return held
 
 
