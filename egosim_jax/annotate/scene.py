@@ -167,7 +167,7 @@ def build_state(record: Record, estimators: Estimators, config: AnnotateConfig) 
 def join_objects(
     ids: Int32[np.ndarray, "h w"], names: Mapping[int, str], standing: Int32[np.ndarray, "h w"]
 ) -> tuple[Int32[np.ndarray, "h w"], dict[int, str]]:
-    """Return ids and names of the objects that hands move, joined by the others that stand.
+    """Return ids and names of the objects that hands move, joined by other objects.
 
     An object whose pixels are mostly on a moved one is part of it.
     """

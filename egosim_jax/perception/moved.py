@@ -1,7 +1,7 @@
 """Objects that a hand moves in a recorded video, found in its first frame and followed.
 
 Corners of the first frame are tracked. Corners that leave the place where the camera's motion would
-take them, beside a hand and by about the hand's own motion, are on an object that the hand moves.
+take them, next to a hand and by about the hand's own motion, are on an object that the hand moves.
 Their common similarity transform follows the object in the image. A pixel of the first frame
 belongs to the object if moving with it explains the pixel's later colors better than resting does.
 An object that moves with the hand and continues to the border of the image is the wearer's sleeve.

@@ -48,7 +48,7 @@ def segment_moved(
     own = np.zeros(frames.shape[1:3], np.uint8)
     outline = cv2.convexHull(np.rint(start).astype(np.int32))
     cv2.fillConvexPoly(own, outline, 1)
-    own = cv2.erode(own, np.ones((WINDOW_PX // 2 + 1,) * 2, np.uint8))  # corners may be beside it
+    own = cv2.erode(own, np.ones((WINDOW_PX // 2 + 1,) * 2, np.uint8))  # corners may be next to it
     chosen = _compared(start, motion)
     low, high = start.min(axis=0), start.max(axis=0)
     border = AROUND * (high - low).max() + 4
@@ -161,7 +161,7 @@ def _look_up(
 def _at_corners(
     own: UInt8[np.ndarray, "h w"], start: Float32[np.ndarray, "n 2"]
 ) -> UInt8[np.ndarray, "h w"]:
-    """Return the connected parts of a mask that have corners in or beside them."""
+    """Return the connected parts of a mask that have corners in or next to them."""
     import cv2
 
     _, parts = cv2.connectedComponents(own)

@@ -69,7 +69,7 @@ def test_the_prior_of_a_fixed_camera_is_checked_too(rung):
     check_prior("incremental", changing, config())
 
 
-def test_moved_objects_are_joined_by_those_that_stand():
+def test_moved_objects_are_joined_by_other_objects():
     ids, standing = np.zeros((2, 8, 8), np.int32)
     ids[2:5, 2:5] = 3
     standing[1:5, 2:5] = 1

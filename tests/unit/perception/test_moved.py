@@ -22,7 +22,7 @@ def still_cameras():
 
 
 def painted(steps, *, hand=True):
-    """Return frames, masks of the box, and tracks of a hand beside it, both moved by steps."""
+    """Return frames, masks of the box, and tracks of a hand next to it, both moved by steps."""
     background = textured_video(1, HEIGHT, WIDTH, seed=1)[0] // 2
     texture = 127 + textured_video(1, 30, 30, seed=2)[0] // 2
     frames, shown = np.repeat(background[None], FRAMES, 0), np.zeros((FRAMES, HEIGHT, WIDTH), bool)

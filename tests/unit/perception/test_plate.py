@@ -69,7 +69,7 @@ def test_pixels_that_no_frame_shows_are_filled_by_patches(clip, covered):
 
 
 @pytest.mark.parametrize("method", ["patchmatch", "telea"])
-def test_a_hole_beside_a_moved_object_is_filled_with_background(method, monkeypatch):
+def test_a_hole_next_to_a_moved_object_is_filled_with_background(method, monkeypatch):
     if method == "telea":
         monkeypatch.setitem(__import__("sys").modules, "patchmatch", None)
     frames = np.full((3, 60, 90, 3), (90, 120, 90), np.uint8)
