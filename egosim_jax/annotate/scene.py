@@ -1,4 +1,4 @@
-"""Last stages of an annotation: metric scale, first frame without hands, scene state, caption."""
+"""Last stages of an annotation: scale, moved objects, first frame without hands, state, caption."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Int32, UInt8
 
 from egosim_jax.annotate.config import AnnotateConfig, Estimators
 from egosim_jax.annotate.prepare import RefusedError
@@ -25,12 +25,20 @@ from egosim_jax.annotate.stages import (
 )
 from egosim_jax.evaluation.metrics.image import decibels
 from egosim_jax.geometry import invert, pixel_rays, pixels_of, transform
+from egosim_jax.io.bounded import unlike
 from egosim_jax.perception.estimates import DepthEstimate, Rung
 from egosim_jax.rendering import POINT_PX
 from egosim_jax.rendering.reference import splat
 from egosim_jax.state.depth import state_from_depth
+from egosim_jax.state.instances import find_objects
 from egosim_jax.types import SceneState, Triplet
 
+MOVED = "moved object"
+"""Name of an object that a hand moves, if no network names it."""
+MIN_FIXED_DB = 16.0
+"""Minimum PSNR of the background if the camera stays in its place, in decibels."""
+GOOD_DB = 35.0
+"""PSNR above which the background of a camera that stays in its place need not improve."""
 PLATE_MARGIN = 1 / 80
 """Width of the border around hands that is replaced, too, as a fraction of the image width."""
 FRAMES_AT_ONCE = 64
@@ -84,13 +92,43 @@ def _sparse_depth(record: Record) -> DepthEstimate:
     )
 
 
+def find_moved_objects(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
+    """Add `moved_ids`, and their pixels and names: the objects that hands move in the clip.
+
+    An object that a network segmented keeps its id. A sleeve counts as an arm.
+    """
+    from egosim_jax.perception.moved import find_moved
+
+    ids, names = record.require("object_ids").copy(), dict(record.names or {})
+    found = []
+    if record.hands is not None and visible(record.hands).any():
+        depth_m = record.require("depth").depth_m[0]
+        found = find_moved(record.frames, record.moving, record.hands, record.cameras, depth_m)
+    numbers: list[int] = []
+    for moved in found:
+        known, count = np.unique(ids[0][moved.first], return_counts=True)
+        number = int(known[count.argmax()])
+        if moved.worn:
+            number = -1
+        elif number <= 0:
+            number = max(int(ids.max()), *names, 0) + 1
+            names[number] = MOVED if MOVED not in names.values() else f"{MOVED} {number}"
+        ids[moved.shown & (ids == 0)] = number
+        numbers += [number] * (number > 0)
+    notes = {"moved": {number: int((ids[0] == number).sum()) for number in numbers}}
+    moved_ids = np.array(numbers, np.int32)
+    return record.add("objects", notes, object_ids=ids, names=names, moved_ids=moved_ids)
+
+
 def clean_first_frame(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
     """Add `first_frame`: hands and arms are replaced from other frames, or inpainted."""
     from egosim_jax.perception.plate import clean_plate
 
     depth_m = record.require("depth").depth_m[0]
     margin = max(2, round(PLATE_MARGIN * record.plan.width))
-    plate = clean_plate(record.frames, record.moving, record.cameras, depth_m, margin_px=margin)
+    plate = clean_plate(
+        record.frames, record.moving, record.cameras, depth_m, moved=record.moved, margin_px=margin
+    )
     notes = {
         "hand_px": int(record.moving[0].sum()),
         "seen_px": int(plate.seen.sum()),
@@ -103,21 +141,48 @@ def build_state(record: Record, estimators: Estimators, config: AnnotateConfig) 
     """Add `state`, the scene of the prior, from the first frame or also from key frames."""
     from egosim_jax.perception.depth import points_per_pixel
 
-    cameras, ids, depth = record.cameras, record.object_ids, record.require("depth")
-    objects = None if ids is None else np.maximum(ids[0], 0)
+    cameras, depth = record.cameras, record.require("depth")
+    ids, names = np.maximum(record.require("object_ids")[0], 0), dict(record.names or {})
+    if estimators.segmenter is None and depth.confident[0].any():  # not on an assumed plane
+        standing = find_objects(
+            record.require("first_frame"), depth.depth_m[0], cameras.intrinsics_px
+        )
+        ids, names = join_objects(ids, names, standing)
     state = state_from_depth(
         record.require("first_frame"),
         depth.depth_m[0],
         cameras.intrinsics_px,
         cameras.world_from_camera[0],
-        object_ids=objects,
-        names=record.names,
+        object_ids=ids,
+        names=names,
         points_per_pixel=points_per_pixel(depth.depth_m[0], cameras),
     )
     for frame, depth_m in zip(depth.frames[1:], depth.depth_m[1:], strict=True):
         state = extend_state(state, record, int(frame), depth_m)
     state = replace(state, provenance={"source": "video", "video_id": record.video_id})
-    return record.add("scene", {"state": config.state, "points": len(state.points_m)}, state=state)
+    notes = {"state": config.state, "points": len(state.points_m), "objects": names}
+    return record.add("scene", notes, state=state)
+
+
+def join_objects(
+    ids: Int32[np.ndarray, "h w"], names: Mapping[int, str], standing: Int32[np.ndarray, "h w"]
+) -> tuple[Int32[np.ndarray, "h w"], dict[int, str]]:
+    """Return ids and names of the objects that hands move, joined by other objects.
+
+    An object whose pixels are mostly on a moved one is part of it.
+    """
+    joined, named = ids.copy(), dict(names)
+    for number in range(1, int(standing.max()) + 1):
+        own = standing == number
+        known = np.unique(ids[own & (ids > 0)], return_counts=True)
+        shared = int(known[1].max(initial=0))
+        if own.any() and 2 * shared > own.sum():
+            new = int(known[0][known[1].argmax()])
+        else:
+            new = max(int(joined.max()), *named, 0) + 1
+            named[new] = f"object {new}"
+        joined[own & (joined == 0)] = new
+    return joined, named
 
 
 def extend_state(
@@ -130,7 +195,8 @@ def extend_state(
     here = replace(record.cameras, world_from_camera=pose[None])
     # Slightly larger points than in the prior close the gaps between the points of a surface.
     seen, _ = splat(state.points_m, here, point_px=POINT_PX + 1)
-    hidden = cv2.dilate(record.moving[frame].astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    hidden = (record.moving[frame] | record.moved[frame]).astype(np.uint8)
+    hidden = cv2.dilate(hidden, np.ones((7, 7), np.uint8)) > 0
     new = ~np.isfinite(seen[0]) & ~hidden & np.isfinite(depth_m)
     rays = pixel_rays(here.intrinsics_px, height=here.height, width=here.width)[new]
     points = transform(pose, rays * depth_m[new][:, None]).astype(np.float32)
@@ -146,7 +212,8 @@ def extend_state(
 
 def add_caption(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
     """Add `prompt`: given, recorded, written by a network, or made by a rule."""
-    names = sorted(set((record.names or {}).values()) | set(record.recording.names))
+    named = {name for name in (record.names or {}).values() if not name.startswith(MOVED)}
+    names = sorted(named | set(record.recording.names))
     if config.caption_text is not None:
         prompt, source = config.caption_text, "--caption"
     elif record.recording.caption and estimators.captioner is None:
@@ -193,7 +260,8 @@ def to_triplet(record: Record, config: AnnotateConfig) -> tuple[Triplet, dict[st
             "rung": record.require("estimate").verdict.rung,
         },
     )
-    judged = drawn & ~record.moving  # not the mask: its observed region is wider than the points
+    # Not the mask: its observed region is wider than the points.
+    judged = drawn & ~record.moving & ~record.moved
     judged[0] = False
     first = np.broadcast_to(record.frames[0], record.frames.shape)
     return triplet, {
@@ -246,16 +314,28 @@ def _psnr(
 
 
 def check_prior(rung: Rung, figures: Mapping[str, float], config: AnnotateConfig) -> None:
-    """Raise `RefusedError` if the prior shows the background worse than the first frame does."""
-    if rung in ("static", "rotation"):  # the prior is the first frame itself, at most turned
-        return
-    gain = figures["psnr_background"] - figures["psnr_first_frame"]
+    """Raise `RefusedError` if the prior shows the background worse than the first frame does.
+
+    A camera that stays or turns in its place must also show the first frame's background again.
+    """
+    fixed = rung in ("static", "rotation")  # the prior is the first frame itself, at most turned
+    shown, first = figures["psnr_background"], figures["psnr_first_frame"]
+    gain = shown - (min(first, GOOD_DB) if fixed else first)
     limit = config.cutting.quality.min_prior_gain_db
     if gain < limit:
         raise RefusedError(
             "prior",
             f"prior: the PSNR of the background is {gain:+.1f} dB relative to the repeated first "
             f"frame, below {limit:+.1f} dB. Cameras or depth are wrong. (--min-prior-gain)",
+            figures,
+        )
+    if fixed and shown < MIN_FIXED_DB and np.isfinite(limit):
+        raise RefusedError(
+            "prior",
+            f"prior: the PSNR of the background is {unlike(shown, MIN_FIXED_DB, '.1f')} dB, below "
+            f"{MIN_FIXED_DB:g} dB: the camera seems fixed ({rung}), but the scene changes, as in a "
+            "recording of a screen. Choose another camera method (--rung), annotate other parts "
+            "(--clips), or allow it by --min-prior-gain=-inf. (--min-prior-gain)",
             figures,
         )
 
@@ -267,6 +347,7 @@ STAGES = (
     Stage("lens", undistort_clip),
     Stage("depth", find_depth, ("depth",)),
     Stage("scale", find_scale),
+    Stage("objects", find_moved_objects, ("object_ids", "names", "moved_ids")),
     Stage("plate", clean_first_frame, ("first_frame",)),
     Stage("scene", build_state),
     Stage("caption", add_caption, ("prompt",)),
