@@ -21,8 +21,8 @@ from egosim_jax.types import Cameras, SceneState
 
 FRAMES = 5
 """Number of compared frames, from the grasp to the end."""
-ADVANTAGE = 1.0
-"""Minimum advantage of each smaller growth, in 8-bit levels."""
+HANDICAP = 1.1
+"""Factor by which each smaller growth must explain the clip better."""
 MARGIN_M = 0.05
 """Distance around the moved points within which the state is drawn, in meters."""
 POINT_PX = 2
@@ -39,12 +39,12 @@ def choose_extent(
 ) -> int:
     """Return the index of the motion whose growth explains the clip best, the largest first.
 
-    A smaller growth must explain it better than the one before by a margin.
+    Each smaller growth must explain it better by a factor: gray frames explain nothing.
     """
     if len(motions) == 1:
         return 0
     costs = predicted_costs(motions, cameras, state, shown, hidden, color)
-    return int(np.argmin(costs + ADVANTAGE * np.arange(len(costs))))
+    return int(np.argmin(costs * HANDICAP ** np.arange(len(costs))))
 
 
 def predicted_costs(
