@@ -102,7 +102,7 @@ def tabletop_start(seed: int, spec: ActionSpec, video: VideoSpec) -> Start:
 
 def neutral_prompt(spec: ActionSpec) -> str:
     """Return a prompt that names no object and no goal: the policy alone decides what happens."""
-    who = "gripper" if spec.kind == "robot" else "hand"
-    if len(spec.sides) > 1:
-        return f"The {who}s move."
-    return "The gripper moves." if spec.kind == "robot" else f"The {spec.sides[0]} hand moves."
+    side, *others = spec.sides
+    if spec.kind == "robot":
+        return "The grippers move." if others else "The gripper moves."
+    return "The hands move." if others else f"The {side} hand moves."

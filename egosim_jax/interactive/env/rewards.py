@@ -84,6 +84,7 @@ def no_reward(outcome: Outcome) -> Reward:
     return Reward(reward=0.0)
 
 
+@no_type_check
 @dataclass(frozen=True, kw_only=True)
 class MoveObject:
     """Task of moving an object by an offset; success is exact in the true world."""

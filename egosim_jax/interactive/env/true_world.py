@@ -43,7 +43,6 @@ class TrueWorld:
     """Backend that executes actions in the tabletop world and returns its ground truth."""
 
     needs_past: ClassVar[bool] = True
-    trained_on: ClassVar[str | None] = None
     video: VideoSpec
     """Length, size and rate of the clips."""
     _changing: threading.Lock = field(
@@ -52,6 +51,11 @@ class TrueWorld:
     _worlds: OrderedDict[str, World] = field(
         default_factory=OrderedDict, init=False, repr=False, compare=False
     )
+
+    @property
+    def trained_on(self) -> None:
+        """Return None: this world has no model."""
+        return None
 
     def identity(self) -> dict[str, str]:
         """Return the size of the clips; nothing else varies."""

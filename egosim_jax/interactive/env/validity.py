@@ -17,11 +17,12 @@ from egosim_jax.types import Action, SceneState, View
 
 MAX_LEVELS = 25
 """Maximum color difference (0 to 255) of a pixel that agrees with the state."""
-SKELETON_MARGIN, ARM_MARGIN = 0.08, 0.02
-"""Margins around skeletons, for the background, and around hands with flesh and forearms, for
-objects, as fractions of the image width: pixels within may change."""
+SKELETON_MARGIN = 0.08
+"""Margin around a skeleton in which the background may change, as a fraction of the width."""
+ARM_MARGIN = 0.02
+"""Margin around a hand and its forearm in which objects may change, as a fraction of the width."""
 BLUR = 0.01
-"""Radius of the blur in which objects are compared, as a fraction of the image width.
+"""Radius of the blur in which objects are compared, as a fraction of the width.
 
 Generated frames are softer than points: stripes would disagree without it."""
 TOUCH_M = 0.05
