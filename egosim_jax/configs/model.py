@@ -268,7 +268,7 @@ class Networks(nnx.Module):
 
     @classmethod
     def random(cls, config: ModelConfig, *, seed: int) -> Networks:
-        """Build untrained networks in one compiled program."""
+        """Build untrained networks."""
         graph = nnx.graphdef(cls.abstract(config))
 
         def make(key: jax.Array) -> nnx.State:
