@@ -14,6 +14,7 @@ from tests.flags import QUICK
 os.environ.setdefault("XLA_FLAGS", QUICK)
 CACHE = Path(__file__).parents[1] / ".pytest_cache"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE / "compiled"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ["XDG_CACHE_HOME"] = str(CACHE / "home")
 
 NEEDS_TORCH = re.compile(r"^(?:import|from) torch\b", re.MULTILINE)
