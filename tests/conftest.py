@@ -3,7 +3,7 @@
 import gc
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Generator
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from tests.flags import QUICK
 os.environ.setdefault("XLA_FLAGS", QUICK)
 CACHE = Path(__file__).parents[1] / ".pytest_cache"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE / "compiled"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ["XDG_CACHE_HOME"] = str(CACHE / "home")
 
 NEEDS_TORCH = re.compile(r"^(?:import|from) torch\b", re.MULTILINE)
@@ -27,8 +28,8 @@ def pytest_ignore_collect(collection_path: Path) -> bool | None:
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_collection() -> Iterator[None]:
-    """Leave what is imported out of every search for garbage."""
+def pytest_collection() -> Generator[None, object, object]:
+    """Exempt imported modules from searches for garbage."""
     gc.disable()
     try:
         return (yield)
@@ -38,8 +39,10 @@ def pytest_collection() -> Iterator[None]:
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> Iterator[None]:
-    """Leave out what a module keeps, too: jax's traces, of which a search takes seconds."""
+def pytest_runtest_protocol(
+    item: pytest.Item, nextitem: pytest.Item | None
+) -> Generator[None, object, object]:
+    """Exempt what a finished module keeps, such as jax's traces: a search took 7 seconds."""
     done = yield
     if nextitem is None or nextitem.path != item.path:
         gc.collect()

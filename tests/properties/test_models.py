@@ -40,7 +40,7 @@ def test_a_product_of_rotated_vectors_depends_on_the_difference_of_positions(fir
 def halves():
     """Return encoder and decoder of a small VAE, compiled: functions of a chunk and a cache."""
     config = replace(configs.get("debug").vae, dim=4)
-    graph, params = nnx.split(nnx.jit(lambda: config.build(rngs=nnx.Rngs(0)))())
+    graph, params = nnx.split(config.build(rngs=nnx.Rngs(0)))
 
     def compiled(half):
         run = jax.jit(lambda params, x, memory: getattr(nnx.merge(graph, params), half)(x, memory))

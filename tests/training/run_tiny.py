@@ -56,17 +56,16 @@ def training(steps: int, save_every: int) -> TrainConfig:
 
 def fit(data: Path, out: Path, *, steps: int, save_every: int, task: str) -> None:
     """Train, and write the weights."""
-    with training_context():
-        schedule = training(steps, save_every)
-        networks = train(TASKS[task], schedule, data=data, validation=None, out=out)
-        weights.save(out / "dit.safetensors", networks.dit)
+    networks = train(TASKS[task], training(steps, save_every), data=data, validation=None, out=out)
+    weights.save(out / "dit.safetensors", networks.dit)
 
 
 def main(data: str, out: str, steps: str, save_every: str, task: str = "egosim") -> int:
     """Train as the commands do."""
 
     def run() -> int:
-        fit(Path(data), Path(out), steps=int(steps), save_every=int(save_every), task=task)
+        with training_context():
+            fit(Path(data), Path(out), steps=int(steps), save_every=int(save_every), task=task)
         return ExitCode.DONE
 
     return run_with_exit_codes(run)

@@ -41,7 +41,7 @@ def test_a_layout_without_a_prior_trains_unless_changes_shall_weigh_more():
     layout = ChannelLayout(parts=(("noisy", 16),))
     model = dataclasses.replace(MODEL, dit=dit, layout=layout)
     task = Denoising(model=model)
-    networks = nnx.jit(lambda: task.networks(nnx.Rngs(0)))()
+    networks = task.networks(nnx.Rngs(0))
     batch = {name: jnp.zeros(s.shape, s.dtype) for name, s in task.shapes(2).items()}
     batch.pop("prior", None)
     loss, _ = nnx.jit(task.loss)(networks, batch, task.keys(jax.random.key(0), 2))

@@ -123,7 +123,7 @@ def test_gradient_accumulation_gives_the_same_run(points, tmp_path):
 
 
 def test_the_ema_follows_its_formula(points, tmp_path):
-    decay, steps = 0.8, 3
+    decay, steps = 0.6, 3
     weights = [
         values(fit(tmp_path / str(n), points, steps=n, save_every=n)).astype(float)
         for n in range(1, steps + 1)

@@ -133,7 +133,12 @@ HOSTILE_METRICS = {
 }
 
 
-@pytest.mark.parametrize("kind", HOSTILE_METRICS)
+SLOW = {"many": pytest.mark.slow}
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=SLOW.get(kind, ())) for kind in HOSTILE_METRICS]
+)
 def test_a_page_is_made_of_any_metrics(tmp_path, kind):
     run = write_stage(tmp_path / "run")
     lines = [json.dumps({"step": step} | HOSTILE_METRICS[kind]) for step in (1, 2)]

@@ -267,21 +267,24 @@ def run_with_jax(home: Path, most: int = 1024) -> tuple[Path, float, int, str]:
 
 @pytest.fixture(scope="module")
 def filled(tmp_path_factory):
-    """The cache home, result, hits and warnings of a first run."""
-    home = tmp_path_factory.mktemp("filled")
-    return home, *run_with_jax(home)[1:]
+    """The cache home of a first run, a copy of it, and the result, hits and warnings."""
+    home = tmp_path_factory.mktemp("filled") / "home"
+    _, *seen = run_with_jax(home)
+    return home, shutil.copytree(home, home.with_name("copy")), *seen
 
 
 @pytest.fixture
-def with_jax(filled, tmp_path):
+def with_jax(filled):
     """The folder and result of a first run, and a function that runs the program again."""
-    home = shutil.copytree(filled[0], tmp_path / "home")
-    return home / "egosim_jax" / "jax", filled[1], partial(run_with_jax, home)
+    home, copy, want, *_ = filled  # jax's keys depend on the path
+    shutil.rmtree(home)
+    shutil.copytree(copy, home)
+    return home / "egosim_jax" / "jax", want, partial(run_with_jax, home)
 
 
 def test_jaxs_own_cache_is_private_and_bounded(with_jax, filled):
     folder, want, run = with_jax
-    assert filled[2:] == (0, "")
+    assert filled[3:] == (0, "")
     assert folder.stat().st_mode & 0o777 == 0o700
     files = set(folder.iterdir())
     assert run() == (folder, want, len(files), "")

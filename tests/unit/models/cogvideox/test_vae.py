@@ -15,7 +15,7 @@ from tests.parity.cogvideox_configs.dwm_tiny import CONFIG as TINY
 @pytest.mark.parametrize("first", [1, 3])
 def test_latents_are_decoded_in_chunks_of_the_first_and_then_two(first):
     config = replace(TINY.vae, decode_first=first)
-    vae = nnx.jit(lambda: config.build(rngs=nnx.Rngs(0)))()
+    vae = config.build(rngs=nnx.Rngs(0))
     latents = jax.random.normal(jax.random.key(1), (1, 5, 2, 2, config.z_dim))
     decode = nnx.jit(lambda vae, latents, cache: vae.decoder(latents, cache))
     parts, cache = [], None
