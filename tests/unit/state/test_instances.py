@@ -7,6 +7,7 @@ import pytest
 
 from egosim_jax.state.depth import state_from_depth
 from egosim_jax.state.instances import find_objects, object_sizes
+from egosim_jax.types import InputError
 from tests.boxes import GREEN, RED, Box, cameras, cast
 
 VIEW = cameras(1)
@@ -92,3 +93,11 @@ def test_sizes_are_of_the_visible_points():
     state = state_from_depth(image, depth, VIEW.intrinsics_px, np.eye(4), object_ids=ids)
     (size,) = object_sizes(state).values()
     np.testing.assert_allclose(size, [0.06, 0.06, 0.1], atol=0.012)
+
+
+def test_arrays_that_do_not_fit_are_refused():
+    image, depth, _ = cast([], VIEW)
+    with pytest.raises(InputError, match="must have the same size"):
+        find_objects(image[:-1], depth, VIEW.intrinsics_px)
+    with pytest.raises(InputError, match="Convert depth_m to meters"):
+        find_objects(image, 1000 * depth, VIEW.intrinsics_px)
