@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from egosim_jax.geometry import pixel_rays, transform, upsample_intrinsics
-from egosim_jax.types import SceneState, check_counts
+from egosim_jax.types import InputError, SceneState, check_counts
 
 DEPTH_M = (0.05, 50.0)
 """Minimum and maximum median depth, in meters."""
@@ -61,6 +61,48 @@ def state_from_depth(
         names=dict(names or {}),
         provenance={"source": "depth image"},
     )
+
+
+@no_type_check  # shapes and dtypes are checked with messages for users
+def known_depth(
+    image: UInt8[np.ndarray, "_ _ 3"],
+    depth_m: Float[np.ndarray, "h w"],
+    object_ids: Int[np.ndarray, "_ _"] | None = None,
+) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels with known depth. Raises `InputError` as `state_from_depth` does."""
+    for name, value, rule, fits in (
+        ("depth_m", depth_m, "(height, width)", np.ndim(depth_m) == 2),
+        (
+            "image",
+            image,
+            "uint8 (height, width, 3)",
+            np.ndim(image) == 3 and image.shape[2] == 3 and image.dtype == np.uint8,
+        ),
+    ):
+        if not fits:
+            raise InputError(f"{name} is {value.dtype} {value.shape}: it must be {rule}.")
+    height, width = depth_m.shape
+    shapes = {"image": image.shape[:2]}
+    if object_ids is not None:
+        shapes["object_ids"] = object_ids.shape
+    for name, shape in shapes.items():
+        if shape != (height, width):
+            raise InputError(
+                f"{name} is {shape[1]}x{shape[0]} and depth_m is {width}x{height} pixels: they "
+                "must have the same size. Resize one of them."
+            )
+    known = np.isfinite(depth_m) & (depth_m > 0)
+    if not known.any():
+        raise InputError(
+            "depth_m has no positive finite value: at least one pixel must have depth."
+        )
+    median = float(np.median(depth_m[known]))
+    if not DEPTH_M[0] <= median <= DEPTH_M[1]:
+        raise InputError(
+            f"The median depth is {median:.4g}: in meters it must be from {DEPTH_M[0]} to "
+            f"{DEPTH_M[1]}. Convert depth_m to meters (millimeters / 1000)."
+        )
+    return known
 
 
 def between_surfaces(depth_m: Float[np.ndarray, "h w"], focal_px: float) -> Bool[np.ndarray, "h w"]:
