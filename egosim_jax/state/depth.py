@@ -15,8 +15,10 @@ DEPTH_M = (0.05, 50.0)
 """Minimum and maximum median depth, in meters."""
 EDGE = 0.03
 """Maximum relative change of depth by interpolation; beyond it, a pixel keeps its own depth."""
-STEEP = 8.0
-"""Minimum step of the depth on a ramp, in widths of a pixel's footprint: 83 degrees."""
+STEEP = 4.0
+"""Minimum step of the depth at an edge, in widths of a pixel's footprint: a slope of 76 degrees."""
+MIN_SMEARED = 0.25
+"""Minimum fraction of edges that are ramps; in a depth image with fewer, a ramp is a surface."""
 MAX_RAMP_PX = 6
 """Maximum number of pixels between the two surfaces of an edge."""
 FLAT = 0.01
@@ -109,9 +111,11 @@ def between_surfaces(depth_m: Float[np.ndarray, "h w"], focal_px: float) -> Bool
     """Return the pixels whose depth is between two surfaces that they do not belong to.
 
     Along a row or a column, such pixels are a short steep ramp with a surface at each end. A sharp
-    edge has no pixel on its ramp. Depth is NaN where it is unknown.
+    edge has no pixel on its ramp; where most edges are sharp, nothing is found. Depth is NaN where
+    it is unknown.
     """
     found = np.zeros(depth_m.shape, bool)
+    edges = ramps = 0
     for depth, target in ((depth_m, found), (depth_m.T, found.T)):
         inverse = 1 / depth
         step = np.diff(depth, axis=1)
@@ -121,7 +125,7 @@ def between_surfaces(depth_m: Float[np.ndarray, "h w"], focal_px: float) -> Bool
         bend = inverse[:, :-2] - 2 * inverse[:, 1:-1] + inverse[:, 2:]
         flat[:, 1:-1] = (sign[:, :-1] == 0) & (sign[:, 1:] == 0)
         flat[:, 1:-1] &= np.abs(bend) <= FLAT * inverse[:, 1:-1]
-        for length in range(1, MAX_RAMP_PX + 1):
+        for length in range(MAX_RAMP_PX + 1):
             # Columns: surface 0 to 2, ramp 3 to 2 + length, surface 3 + length to 5 + length.
             count = depth.shape[1] - length - 5
             if count < 1:
@@ -130,9 +134,11 @@ def between_surfaces(depth_m: Float[np.ndarray, "h w"], focal_px: float) -> Bool
             first = sign[:, 2 : 2 + count]
             for column in range(length + 1):
                 ramp &= (sign[:, 2 + column : 2 + column + count] == first) & (first != 0)
+            edges += int(ramp.sum())
+            ramps += int(ramp.sum()) if length else 0
             for column in range(3, 3 + length):
                 target[:, column : column + count] |= ramp
-    return found
+    return found & (ramps >= MIN_SMEARED * edges)
 
 
 def _split(
