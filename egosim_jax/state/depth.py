@@ -46,8 +46,7 @@ def state_from_depth(
     shapes or dtypes differ, if no depth is known, or if the depth does not look like meters.
     """
     check_counts({"points_per_pixel": points_per_pixel})
-    known = known_depth(image, depth_m, object_ids)
-    known &= ~between_surfaces(np.where(known, depth_m, np.nan), float(intrinsics_px[0][0]))
+    known = known_depth(image, depth_m, intrinsics_px, object_ids)
     ids = np.zeros(depth_m.shape, np.int32) if object_ids is None else object_ids
     matrix = upsample_intrinsics(np.asarray(intrinsics_px, float), points_per_pixel)
     if points_per_pixel > 1:
@@ -69,9 +68,13 @@ def state_from_depth(
 def known_depth(
     image: UInt8[np.ndarray, "_ _ 3"],
     depth_m: Float[np.ndarray, "h w"],
+    intrinsics_px: Float[np.ndarray, "3 3"],
     object_ids: Int[np.ndarray, "_ _"] | None = None,
 ) -> Bool[np.ndarray, "h w"]:
-    """Return the pixels with known depth. Raises `InputError` as `state_from_depth` does."""
+    """Return the pixels with the depth of a surface: positive, finite, not between two surfaces.
+
+    Raises `InputError` as `state_from_depth` does.
+    """
     for name, value, rule, fits in (
         ("depth_m", depth_m, "(height, width)", np.ndim(depth_m) == 2),
         (
@@ -104,7 +107,8 @@ def known_depth(
             f"The median depth is {median:.4g}: in meters it must be from {DEPTH_M[0]} to "
             f"{DEPTH_M[1]}. Convert depth_m to meters (millimeters / 1000)."
         )
-    return known
+    smeared = between_surfaces(np.where(known, depth_m, np.nan), float(intrinsics_px[0][0]))
+    return known & ~smeared
 
 
 def between_surfaces(depth_m: Float[np.ndarray, "h w"], focal_px: float) -> Bool[np.ndarray, "h w"]:

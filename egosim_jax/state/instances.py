@@ -76,12 +76,11 @@ def find_objects(
     """
     import cv2
 
-    known_depth(image, depth_m)
+    surface = known_depth(image, depth_m, intrinsics_px)
     search = search or ObjectSearch()
     every = max(1, -(-max(depth_m.shape) // search.max_width))
-    coarse = np.asarray(depth_m[::every, ::every], float)
-    known = np.isfinite(coarse) & (coarse > 0)
-    coarse = np.where(known, coarse, 0.0)
+    known = surface[::every, ::every]
+    coarse = np.where(known, depth_m[::every, ::every], 0.0).astype(float)
     rays = pixel_rays(np.asarray(intrinsics_px, float), height=image.shape[0], width=image.shape[1])
     points = rays[::every, ::every] * coarse[..., None]
     shown = cv2.GaussianBlur(image, (0, 0), 0.5 * every) if every > 1 else image
