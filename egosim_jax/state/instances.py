@@ -11,11 +11,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
 from egosim_jax.geometry import pixel_rays
+from egosim_jax.state.depth import known_depth
 from egosim_jax.state.planes import SupportPlane, area_of, fit_plane, support_planes
 from egosim_jax.state.regions import RegionConfig, find_regions
 from egosim_jax.types import SceneState, check_counts
@@ -59,6 +61,7 @@ class ObjectSearch:
         check_counts({"max_width": self.max_width, "min_points": self.min_points})
 
 
+@no_type_check  # shapes and dtypes are checked with messages for users
 def find_objects(
     image: UInt8[np.ndarray, "h w 3"],
     depth_m: Float[np.ndarray, "h w"],
@@ -68,15 +71,16 @@ def find_objects(
     """Return the object id of each pixel, from 1 for the largest; 0 is the background.
 
     The image has no hands, and is taken from above the surfaces, by a camera that is not turned on
-    its side. Depth is in meters along the camera's z axis; 0, NaN and infinity mean unknown.
+    its side. Depth is in meters along the camera's z axis; 0, NaN and infinity mean unknown. Raises
+    `InputError` for arrays that `state_from_depth` refuses.
     """
     import cv2
 
+    surface = known_depth(image, depth_m, intrinsics_px)
     search = search or ObjectSearch()
     every = max(1, -(-max(depth_m.shape) // search.max_width))
-    coarse = np.asarray(depth_m[::every, ::every], float)
-    known = np.isfinite(coarse) & (coarse > 0)
-    coarse = np.where(known, coarse, 0.0)
+    known = surface[::every, ::every]
+    coarse = np.where(known, depth_m[::every, ::every], 0.0).astype(float)
     rays = pixel_rays(np.asarray(intrinsics_px, float), height=image.shape[0], width=image.shape[1])
     points = rays[::every, ::every] * coarse[..., None]
     shown = cv2.GaussianBlur(image, (0, 0), 0.5 * every) if every > 1 else image

@@ -83,7 +83,7 @@ def find_regions(
     pairs = _neighbors(points[..., 2], candidates, footprint_m, config)
     parts = _by_color(color.reshape(-1, 3), candidates.ravel(), pairs, config)
     parts = _join_surfaces(parts, points, color, pairs, config)
-    parts = _join_pieces(parts, points.reshape(-1, 3), color.reshape(-1, 3), config)
+    parts = _join_pieces(parts, points, color, config)
     return _compact(parts).reshape(candidates.shape)
 
 
@@ -271,29 +271,39 @@ def _normals(
 
 def _join_pieces(
     parts: Int[np.ndarray, " n"],
-    points: Float[np.ndarray, "n 3"],
-    color: Float32[np.ndarray, "n 3"],
+    points: Float[np.ndarray, "h w 3"],
+    color: Float32[np.ndarray, "h w 3"],
     config: RegionConfig,
 ) -> Int[np.ndarray, " n"]:
-    """Join each separate part with the closest larger part of the same color."""
+    """Join each separate part with the closest larger part of the same hue.
+
+    A sliver, such as the side of a box that is seen at a grazing angle, has no color of its own.
+    """
+    import cv2
     from scipy.spatial import KDTree
 
+    height, width = points.shape[:2]
+    kernel = np.ones((3, 3), np.uint8)
+    flat, hues = points.reshape(-1, 3), (color * np.array([0.4, 1, 1])).reshape(-1, 3)
     numbers, counts = np.unique(parts[parts >= 0], return_counts=True)
     order = numbers[np.argsort(-counts, kind="stable")].tolist()
     sizes = dict(zip(numbers.tolist(), counts.tolist(), strict=True))
     parts, kept = parts.copy(), []
     for number in order:
         own = np.flatnonzero(parts == number)
-        hue = np.median(color[own], axis=0)
+        hue = np.median(hues[own], axis=0)
+        mask = (parts == number).reshape(height, width).astype(np.uint8)
+        sliver = not cv2.erode(mask, kernel, borderValue=0).any()
         best = (np.inf, -1)
         for other, tree, other_hue in kept:
-            if np.linalg.norm(hue - other_hue) <= config.color_difference:
-                small = sizes[number] <= config.piece * sizes[other]
-                gap = float(tree.query(points[own])[0].min())
+            same = np.linalg.norm(hue - other_hue) <= config.color_difference
+            if same or sliver:
+                small = sliver or sizes[number] <= config.piece * sizes[other]
+                gap = float(tree.query(flat[own])[0].min())
                 if gap <= config.gap_m * (1.0 if small else 0.5):
                     best = min(best, (gap, other))
         if best[1] >= 0:
             parts[own] = best[1]
         else:
-            kept.append((number, KDTree(points[own]), hue))
+            kept.append((number, KDTree(flat[own]), hue))
     return parts
