@@ -233,7 +233,7 @@ class Surroundings:
         ray = self.points_m[rest] - self.eye_m
         step = self.points_m[members][nearest] - self.points_m[rest]
         aside = np.linalg.norm(np.cross(step, ray), axis=1) / np.linalg.norm(ray, axis=1)
-        near = (gaps <= 3 * self.radius_m) & (aside <= self.radius_m)
+        near = (gaps <= 3 * self.radius_m) & (aside <= 1.5 * self.radius_m)
         count, close = (np.bincount(parts[rest], weights) for weights in (None, near))
         piece = (close > 0) & ((count < self.config.min_points) | (close >= 0.9 * count))
         grown = members.copy()
