@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from egosim_jax.geometry import cameras_in_object_frame
-from egosim_jax.perception.pose_refinement import ColorCost, ObjectMotion
+from egosim_jax.perception.pose_refinement import ColorCost, ObjectModel, ObjectMotion
 from egosim_jax.rendering.reference import splat
 from egosim_jax.state.new_objects import is_among
 from egosim_jax.types import Cameras, SceneState
@@ -31,6 +31,7 @@ POINT_PX = 2
 
 def choose_extent(
     motions: Sequence[ObjectMotion],
+    whole: ObjectModel,
     cameras: Cameras,
     state: SceneState,
     shown: Float32[np.ndarray, "f h w 3"],
@@ -43,19 +44,24 @@ def choose_extent(
     """
     if len(motions) == 1:
         return 0
-    costs = predicted_costs(motions, cameras, state, shown, hidden, color)
+    costs = predicted_costs(motions, whole, cameras, state, shown, hidden, color)
     return int(np.argmin(costs * HANDICAP ** np.arange(len(costs))))
 
 
 def predicted_costs(
     motions: Sequence[ObjectMotion],
+    whole: ObjectModel,
     cameras: Cameras,
     state: SceneState,
     shown: Float32[np.ndarray, "f h w 3"],
     hidden: Bool[np.ndarray, "f h w"],
     color: ColorCost,
 ) -> Float[np.ndarray, " m"]:
-    """Return how far the scene that each motion predicts is from the clip, in 8-bit levels."""
+    """Return how far the scene that each motion predicts is from the clip, in 8-bit levels.
+
+    Behind the `whole` connected thing is its support. Nobody knows what is behind a part of it, so
+    such pixels are not compared.
+    """
     frames = _compared_frames(motions)
     local = replace(cameras, world_from_camera=cameras.world_from_camera[frames])
     shown, hidden = shown[frames], hidden[frames]
@@ -67,12 +73,16 @@ def predicted_costs(
     everything = np.concatenate([m.model.points_m for m in motions]).astype(np.float32)
     compared |= splat(everything, local, point_px=POINT_PX)[1] >= 0
     compared &= ~hidden
-    costs = []
+    predicted = []
     for motion, (moved_m, moved, rest_m, rest) in zip(motions, layers, strict=True):
-        drawn = np.append(colors, ground[None], axis=0)[rest]
+        behind = ground if motion.model is whole else np.full(3, np.nan, np.float32)
+        drawn = np.append(colors, behind[None], axis=0)[rest]
         nearer = (moved >= 0) & (moved_m < rest_m)
-        drawn = np.where(nearer[..., None], motion.model.colors[moved], drawn)
-        costs.append(color.mean(shown[compared], drawn[compared]) if compared.any() else 0.0)
+        predicted.append(np.where(nearer[..., None], motion.model.colors[moved], drawn))
+        compared &= np.isfinite(predicted[-1]).all(axis=-1)
+    if not compared.any():
+        return np.zeros(len(motions))
+    costs = [color.mean(shown[compared], drawn[compared]) for drawn in predicted]
     return np.array(costs)
 
 

@@ -194,12 +194,13 @@ def _best_candidate(
         moved = [best for best in moved if best is not None]
         if moved:
             motions = [motion for _, motion in moved]
-            found.append(
-                moved[choose_extent(motions, action.cameras, state, shown, hidden, config.color)]
-            )
-    if things and grip.sure and not found:
+            scene = action.cameras, state, shown, hidden, config.color
+            found.append(moved[choose_extent(motions, growths[0], *scene)])
+    if found:
+        return min(found, key=lambda candidate: candidate[0]), ""
+    if things and grip.sure:
         note = "closed on something without an id that the clip shows at rest"
-    return min(found, key=lambda candidate: candidate[0], default=None), note
+    return None, note
 
 
 def _best_motion(
