@@ -21,12 +21,16 @@ from egosim_jax.types import Cameras, SceneState
 
 FRAMES = 5
 """Number of compared frames, from the grasp to the end."""
-HANDICAP = 1.1
+HANDICAP = 1.2
 """Factor by which each smaller growth must explain the clip better."""
+MIN_PIXELS = 30
+"""Minimum number of compared pixels; fewer decide nothing."""
 MARGIN_M = 0.05
 """Distance around the moved points within which the state is drawn, in meters."""
 POINT_PX = 2
 """Size of the drawn points in pixels."""
+SQUARE = np.ones((3, 3), np.uint8)
+"""A pixel and its neighbors."""
 
 
 def choose_extent(
@@ -62,6 +66,8 @@ def predicted_costs(
     Behind the `whole` connected thing is its support. Nobody knows what is behind a part of it, so
     such pixels are not compared.
     """
+    import cv2
+
     frames = _compared_frames(motions)
     local = replace(cameras, world_from_camera=cameras.world_from_camera[frames])
     shown, hidden = shown[frames], hidden[frames]
@@ -78,12 +84,30 @@ def predicted_costs(
         behind = ground if motion.model is whole else np.full(3, np.nan, np.float32)
         drawn = np.append(colors, behind[None], axis=0)[rest]
         nearer = (moved >= 0) & (moved_m < rest_m)
-        predicted.append(np.where(nearer[..., None], motion.model.colors[moved], drawn))
-        compared &= np.isfinite(predicted[-1]).all(axis=-1)
-    if not compared.any():
+        drawn = np.where(nearer[..., None], motion.model.colors[moved], drawn)
+        unknown = np.isnan(drawn).any(axis=-1)
+        compared &= ~np.stack([cv2.dilate(f.astype(np.uint8), SQUARE) > 0 for f in unknown])
+        predicted.append(_closest(np.nan_to_num(drawn), shown))
+    if compared.sum() < MIN_PIXELS:
         return np.zeros(len(motions))
     costs = [color.mean(shown[compared], drawn[compared]) for drawn in predicted]
     return np.array(costs)
+
+
+def _closest(
+    drawn: Float32[np.ndarray, "g h w 3"], shown: Float32[np.ndarray, "g h w 3"]
+) -> Float32[np.ndarray, "g h w 3"]:
+    """Return the color nearest to the shown one between those drawn within a pixel.
+
+    So a border that the clip blurs, or shows a pixel aside, costs nothing.
+    """
+    import cv2
+
+    low, high = (
+        np.stack([function(frame, SQUARE) for frame in drawn])
+        for function in (cv2.erode, cv2.dilate)
+    )
+    return np.clip(shown, low, high)
 
 
 def _compared_frames(motions: Sequence[ObjectMotion]) -> Int[np.ndarray, " g"]:
