@@ -23,8 +23,8 @@ FRAMES = 5
 """Number of compared frames, from the grasp to the end."""
 HANDICAP = 1.2
 """Factor by which each smaller growth must explain the clip better."""
-MIN_PIXELS = 30
-"""Minimum number of compared pixels; fewer decide nothing."""
+MIN_KNOWN = 0.25
+"""Minimum fraction of the covered pixels that can be compared; fewer decide nothing."""
 MARGIN_M = 0.05
 """Distance around the moved points within which the state is drawn, in meters."""
 POINT_PX = 2
@@ -78,7 +78,8 @@ def predicted_costs(
     compared = np.any([layer[1] >= 0 for layer in layers], axis=0)
     everything = np.concatenate([m.model.points_m for m in motions]).astype(np.float32)
     compared |= splat(everything, local, point_px=POINT_PX)[1] >= 0
-    compared &= ~hidden
+    covered = compared & ~hidden
+    compared = covered.copy()
     predicted = []
     for motion, (moved_m, moved, rest_m, rest) in zip(motions, layers, strict=True):
         behind = ground if motion.model is whole else np.full(3, np.nan, np.float32)
@@ -88,7 +89,7 @@ def predicted_costs(
         unknown = np.isnan(drawn).any(axis=-1)
         compared &= ~np.stack([cv2.dilate(f.astype(np.uint8), SQUARE) > 0 for f in unknown])
         predicted.append(_closest(np.nan_to_num(drawn), shown))
-    if compared.sum() < MIN_PIXELS:
+    if compared.sum() <= MIN_KNOWN * covered.sum():
         return np.zeros(len(motions))
     costs = [color.mean(shown[compared], drawn[compared]) for drawn in predicted]
     return np.array(costs)
