@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from egosim_jax.geometry import cameras_in_object_frame
+from egosim_jax.geometry import cameras_in_object_frame, invert, pixels_of, transform
 from egosim_jax.perception.pose_refinement import ColorCost, ObjectModel, ObjectMotion
 from egosim_jax.rendering.reference import splat
 from egosim_jax.state.new_objects import is_among
@@ -29,6 +29,8 @@ MARGIN_M = 0.05
 """Distance around the moved points within which the state is drawn, in meters."""
 POINT_PX = 2
 """Size of the drawn points in pixels."""
+SMOOTHED, SMOOTHINGS = 12, 4
+"""Number of nearest points that decide together whether they move, and number of rounds."""
 SQUARE = np.ones((3, 3), np.uint8)
 """A pixel and its neighbors."""
 
@@ -50,6 +52,62 @@ def choose_extent(
         return 0
     costs = predicted_costs(motions, whole, cameras, state, shown, hidden, color)
     return int(np.argmin(costs * HANDICAP ** np.arange(len(costs))))
+
+
+def moving_part(
+    motion: ObjectMotion,
+    cameras: Cameras,
+    shown: Float32[np.ndarray, "f h w 3"],
+    hidden: Bool[np.ndarray, "f h w"],
+    color: ColorCost,
+) -> ObjectModel:
+    """Return the part of a thing whose points look more like the clip moved than at rest.
+
+    A lid has no edge where it lies flush on its box. Points that the clip never shows move along.
+    """
+    from scipy.spatial import KDTree
+
+    model, frames = motion.model, _compared_frames([motion])
+    poses = invert(cameras.world_from_camera[frames])
+    local = replace(cameras, world_from_camera=cameras.world_from_camera[frames])
+    paths = (np.repeat(np.eye(4)[None], len(frames), axis=0), motion.path[frames])
+    at_rest, moved = (
+        _residuals(
+            transform(poses @ path, model.points_m),
+            model,
+            local,
+            shown[frames],
+            hidden[frames],
+            color,
+        )
+        for path in paths
+    )
+    gain = np.nan_to_num(at_rest - moved).mean(axis=0)
+    near = KDTree(model.points_m).query(model.points_m, min(SMOOTHED, len(gain)))[1]
+    for _ in range(SMOOTHINGS):
+        gain = gain[near].mean(axis=1)
+    moves = gain >= 0
+    return replace(model, points_m=model.points_m[moves], colors=model.colors[moves])
+
+
+def _residuals(
+    local_m: Float[np.ndarray, "g n 3"],
+    model: ObjectModel,
+    cameras: Cameras,
+    shown: Float32[np.ndarray, "g h w 3"],
+    hidden: Bool[np.ndarray, "g h w"],
+    color: ColorCost,
+) -> Float[np.ndarray, "g n"]:
+    """Return each point's color difference from the clip under any light; NaN where not seen."""
+    row, column, inside = pixels_of(cameras, local_m)
+    frame = np.broadcast_to(np.arange(len(local_m))[:, None], row.shape)
+    row, column = np.where(inside, row, 0), np.where(inside, column, 0)
+    there = shown[frame, row, column]
+    strength = np.maximum((model.colors**2).sum(axis=1), 1)
+    light = (there * model.colors).sum(axis=2) / strength
+    light = np.clip(light, color.min_light, color.max_light)
+    gaps = np.sqrt(np.square(there - light[..., None] * model.colors).mean(axis=2))
+    return np.where(inside & ~hidden[frame, row, column], gaps, np.nan)
 
 
 def predicted_costs(
