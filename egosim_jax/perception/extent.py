@@ -31,6 +31,8 @@ POINT_PX = 2
 """Size of the drawn points in pixels."""
 SMOOTHED, SMOOTHINGS = 12, 4
 """Number of nearest points that decide together whether they move, and number of rounds."""
+AT_REST = 5.0
+"""Minimum advantage of a resting point over a moving one, in 8-bit levels."""
 SQUARE = np.ones((3, 3), np.uint8)
 """A pixel and its neighbors."""
 
@@ -61,9 +63,9 @@ def moving_part(
     hidden: Bool[np.ndarray, "f h w"],
     color: ColorCost,
 ) -> ObjectModel:
-    """Return the part of a thing whose points look more like the clip moved than at rest.
+    """Return a thing without the points that the clip shows at rest.
 
-    A lid has no edge where it lies flush on its box. Points that the clip never shows move along.
+    A lid has no edge where it lies flush on its box. Points that could be both move along.
     """
     from scipy.spatial import KDTree
 
@@ -86,7 +88,7 @@ def moving_part(
     near = KDTree(model.points_m).query(model.points_m, min(SMOOTHED, len(gain)))[1]
     for _ in range(SMOOTHINGS):
         gain = gain[near].mean(axis=1)
-    moves = gain >= 0
+    moves = gain > -AT_REST
     return replace(model, points_m=model.points_m[moves], colors=model.colors[moves])
 
 
