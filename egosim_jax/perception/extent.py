@@ -22,7 +22,7 @@ from egosim_jax.types import Cameras, SceneState
 FRAMES = 5
 """Number of compared frames, from the grasp to the end."""
 SMALLER = 0.1
-"""Exponent of a thing's relative size in the factor by which a part must explain the clip better."""
+"""Exponent of a part's relative size in the factor by which it must explain the clip better."""
 WITHOUT_EDGES = 1.2
 """Factor by which a part without edges must explain the clip better."""
 NOISE = 3.0
