@@ -5,7 +5,7 @@ of a possible hold, and a motion of the hand that the object may follow (`grasps
 mean difference between the object's colors and the clip's colors where the object would be visible.
 The candidate that most improves on the object at rest is accepted. An object between the closing
 fingertips counts as moved unless the clip clearly shows it at rest. A released object falls
-(`fall`), and `pose_refinement` refines its last pose.
+(`fall`) or is put down (`snap`), and `pose_refinement` refines its last pose.
 """
 
 from __future__ import annotations
@@ -38,6 +38,8 @@ MIN_LIFT_M = 0.01
 """Minimum height of a release above the first height, in meters; below it nothing falls."""
 FOOTPRINT_M = 0.006
 """Horizontal distance within which the state's points are below an object, in meters."""
+SNAP_M = 0.02
+"""Maximum height error of a released object, above or below its support, in meters."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +77,7 @@ class TrackObjects:
     color: ColorCost = field(default_factory=ColorCost)
     """Comparison of the clip's colors with the predicted colors."""
     refinement: Refinement = field(
-        default_factory=partial(Refinement, deviation_m=0.005, deviation_deg=5.0)
+        default_factory=partial(Refinement, deviation_m=0.003, deviation_deg=5.0)
     )
     """Refinement of the object's last pose."""
 
@@ -144,10 +146,11 @@ def estimate_object_motion(
             if best is not None:
                 change, motion = best
                 others = state.points_m[state.object_ids != motion.model.number]
-                motion = fall(motion, others, clip.fps)
+                motion = snap(fall(motion, others, clip.fps), others)
                 motion = refine_pose(
                     motion, action.cameras, state, shown, hidden, config.refinement, config.color
                 )
+                motion = snap(motion, others)
                 number = motion.model.number
                 if number not in found or change < found[number][0]:
                     found[number] = change, motion
@@ -296,23 +299,45 @@ def fall(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"], fps: int) -
     `others_m` are the other points of the state. An object does not fall if it was not lifted, if
     it is on a hinge, or if a hand holds it to the end.
     """
-    released, last = motion.released, len(motion.path) - 1
-    normal, offset = motion.model.plane[:3], motion.model.plane[3]
-    if motion.hinged or released == last or not np.isfinite(offset):
+    if not motion.lands:
         return motion
+    up, gap = _gap_below(motion, others_m)
     first = motion.model.points_m
-    side = 1.0 if first.mean(axis=0) @ normal + offset > 0 else -1.0
-    up, floor = side * normal, float(-side * offset)
-    end = transform(motion.path[released], first)
-    if ((end - first) @ up).mean() < MIN_LIFT_M:
+    if ((transform(motion.path[motion.released], first) - first) @ up).mean() < MIN_LIFT_M:
         return motion
-    # Not the clearance alone: only the visible side has points, so it is not 0 on the ground.
-    gap = _clearance(end, others_m, up, floor) - _clearance(first, others_m, up, floor)
-    seconds = np.maximum(np.arange(last + 1) - released, 0) / fps
+    seconds = np.maximum(np.arange(len(motion.path)) - motion.released, 0) / fps
     drop = np.minimum(GRAVITY / 2 * seconds**2, max(gap, 0.0))
     path = motion.path.copy()
     path[:, :3, 3] -= drop[:, None] * up
     return replace(motion, path=path)
+
+
+def snap(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"]) -> ObjectMotion:
+    """Return the motion with a released object at its first height above the surface below it.
+
+    The correction grows from the grasp to the release. Objects that do not `fall` are not snapped,
+    and none whose height differs by more than `SNAP_M`.
+    """
+    if not motion.lands:
+        return motion
+    up, gap = _gap_below(motion, others_m)
+    if abs(gap) > SNAP_M:
+        return motion
+    path = motion.path.copy()
+    path[:, :3, 3] -= motion.carried[:, None] * gap * up
+    return replace(motion, path=path)
+
+
+def _gap_below(
+    motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, " 3"], float]:
+    """Return the direction up, and how much higher above its support the object ends, in meters."""
+    normal, offset = motion.model.plane[:3], motion.model.plane[3]
+    first, end = motion.model.points_m, transform(motion.path[-1], motion.model.points_m)
+    side = 1.0 if first.mean(axis=0) @ normal + offset > 0 else -1.0
+    up, floor = side * normal, float(-side * offset)
+    # Not the clearance alone: only the visible side has points, so it is not 0 on the ground.
+    return up, _clearance(end, others_m, up, floor) - _clearance(first, others_m, up, floor)
 
 
 def _clearance(
