@@ -130,7 +130,8 @@ def refine_pose(
 ) -> ObjectMotion:
     """Return the motion with a last pose that explains the clip better.
 
-    The motion is unchanged if hands cover the object to the end.
+    The motion is unchanged if hands cover the object to the end, or if the clip is more like the
+    scene without the object: then it does not show it anywhere near.
     """
     frames = np.arange(len(best.path))[min(best.released, len(best.path) - config.min_frames) :]
     scene = _Neighborhood.of(best, cameras, state, frames, shown, hidden, config)
@@ -149,6 +150,8 @@ def refine_pose(
                 cost += float(np.square((change + step) / scale).sum())
                 if cost < best_cost:
                     change, best_cost, improved = change + step, cost, True
+    if best_cost > scene.cost_without(color):
+        return best
     return replace(best, path=perturb(best, change))
 
 
@@ -218,3 +221,7 @@ class _Neighborhood:
         nearer = (index >= 0) & (depth < self.background_m)
         drawn = np.where(nearer[..., None], self.model.colors[index], self.background)
         return color.mean(self.shown[self.compared], drawn[self.compared])
+
+    def cost_without(self, color: ColorCost) -> float:
+        """Return the mean difference between the clip and a rendering without the object."""
+        return color.mean(self.shown[self.compared], self.background[self.compared])
