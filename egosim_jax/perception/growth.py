@@ -24,7 +24,9 @@ from egosim_jax.types import Cameras, SceneState
 NEW = 0
 """Number of an object that has no id yet."""
 NEIGHBORS = 16
-"""Number of nearest points that determine a point's normal and its edges."""
+"""Number of nearest points that determine a point's normal."""
+HOLLOW = 0.15
+"""Minimum fraction of concave pairs of a point at a concave edge."""
 MAX_SEEDS = 20
 """Maximum number of points between the fingertips that give an object's color."""
 MIN_HEIGHT_M = 0.002
@@ -44,11 +46,11 @@ class Growth:
     spacings: float = 2.5
     """Maximum distance of connected points, in median distances of nearest points."""
     concave: float = 0.2
-    """Height of neighbors above a point's tangent plane at a concave edge, per distance."""
+    """Height of a point above a neighbor's tangent plane at a concave edge, per distance."""
     edge_deg: float = 25.0
     """Angle between the normals of neighbors at an edge, in degrees."""
-    color_levels: float = 45.0
-    """Difference in color, whatever the light, of points of different objects, in 8-bit levels."""
+    color_levels: tuple[float, ...] = (45.0, 18.0)
+    """Differences in color at which growths end, whatever the light, in 8-bit levels."""
     min_points: int = 30
     """Minimum number of points of an object."""
 
@@ -80,7 +82,8 @@ class Surroundings:
         """Return the surroundings of a hand from the chosen points of a state."""
         points, colors = state.points_m[chosen], state.colors[chosen].astype(np.float32)
         up = np.array(UP_AXES[up_of(state)])
-        surfaces = support_planes(points, up)
+        looks_down = up_of(state) == "-y"  # the first camera's own axis, far from the vertical
+        surfaces = support_planes(points, up, eye_m=eye_m if looks_down else None)
         plane = surfaces[0].plane if surfaces else np.array([*up, np.nan])
         heights = points @ plane[:3] + plane[3]
         near = np.abs(heights)
@@ -122,18 +125,33 @@ class Surroundings:
         return np.where(inward[:, None], -normals, normals)
 
     @cached_property
-    def hollow(self) -> Bool[np.ndarray, " n"]:
-        """Points at a concave edge: the points around them are above their tangent planes."""
-        steps = self.points_m[self.neighbors[:, 1:]] - self.points_m[:, None]
-        rise = np.einsum("nki,ni->nk", steps, self.normals).mean(axis=1)
-        return rise > self.config.concave * np.linalg.norm(steps, axis=2).mean(axis=1)
-
-    @cached_property
     def pairs(self) -> Int[np.ndarray, "p 2"]:
         """Pairs of connected points."""
         from scipy.spatial import KDTree
 
         return KDTree(self.points_m).query_pairs(self.radius_m, output_type="ndarray")
+
+    @cached_property
+    def bends(self) -> Float[np.ndarray, "p 3"]:
+        """Difference of the normals of each pair."""
+        one, other = self.pairs.T
+        return self.normals[one] - self.normals[other]
+
+    @cached_property
+    def concave(self) -> Bool[np.ndarray, " p"]:
+        """Pairs across a concave edge: each point is above the other's tangent plane."""
+        one, other = self.pairs.T
+        steps = self.points_m[other] - self.points_m[one]
+        rise = (self.bends * steps).sum(axis=1) / 2
+        return rise > self.config.concave * np.linalg.norm(steps, axis=1)
+
+    @cached_property
+    def hollow(self) -> Bool[np.ndarray, " n"]:
+        """Points at a concave edge."""
+        count = len(self.points_m)
+        every = np.bincount(self.pairs.ravel(), minlength=count)
+        concave = np.bincount(self.pairs[self.concave].ravel(), minlength=count)
+        return concave > HOLLOW * every
 
     def parts(
         self, members: Bool[np.ndarray, " n"], cut: Bool[np.ndarray, " p"] | None = None
@@ -178,7 +196,7 @@ class Surroundings:
                 continue
             growths = list(self.grow(seeds[parts[seeds] == part], parts == part))
             small = [g for g in growths if self.extent_m(g) <= self.config.max_extent_m]
-            things[part] = [self.model(self.with_crumbs(members)) for members in small]
+            things[part] = [self.model(members) for members in small]
             if not small:
                 limit = self.config.max_extent_m
                 notes.append(f"closed on something larger than {limit} m: it was not moved")
@@ -190,24 +208,21 @@ class Surroundings:
     ) -> Iterator[Bool[np.ndarray, " n"]]:
         """Yield the points of the possible objects around seeds in a part, the largest first."""
         flat = whole & ~self.hollow
-        one, other = self.pairs.T
-        bend = self.normals[one] - self.normals[other]
-        steps = self.points_m[other] - self.points_m[one]
-        rise = (bend * steps).sum(axis=1) / 2
-        concave = rise > self.config.concave * np.linalg.norm(steps, axis=1)
-        sharp = np.linalg.norm(bend, axis=1) > np.radians(self.config.edge_deg)
-        convex = self._fill(self._around(seeds, self.parts(flat, concave)), whole)
-        alike = self._alike(seeds)
+        sharp = np.linalg.norm(self.bends, axis=1) > np.radians(self.config.edge_deg)
+        convex = self._fill(self._around(seeds, self.parts(flat, self.concave)), whole)
+        difference = self._difference(seeds)
+        alike = [difference < levels for levels in self.config.color_levels]
         found: list[Bool[np.ndarray, " n"]] = []
-        for members in (
+        for core in (
             whole,
             convex,
-            self._around(seeds, self.parts(whole & alike)),
-            self._around(seeds, self.parts(convex & alike)),
+            *(self._around(seeds, self.parts(whole & same)) for same in alike),
+            *(self._around(seeds, self.parts(convex & same)) for same in alike),
             self._around(seeds, self.parts(flat, sharp)),
         ):
-            if members.sum() < self.config.min_points:
+            if core.sum() < self.config.min_points:
                 continue
+            members = self.with_crumbs(core)
             if any((members & old).sum() > 0.95 * (members | old).sum() for old in found):
                 continue
             found.append(members)
@@ -220,7 +235,8 @@ class Surroundings:
     def with_crumbs(self, members: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """Return an object's points with the pieces beside it that are too small for an object.
 
-        Such pieces are a seam along its edge, whose points mix two colors, or single points.
+        Such pieces are a seam along its edge, whose points mix two colors or, where the surface
+        turns away from the camera, are far behind each other.
         """
         from scipy.spatial import KDTree
 
@@ -228,8 +244,11 @@ class Surroundings:
         (rest,) = np.nonzero(~members)
         if not len(rest):
             return members
-        gaps = KDTree(self.points_m[members]).query(self.points_m[rest])[0]
-        near = gaps <= 1.5 * self.radius_m
+        gaps, nearest = KDTree(self.points_m[members]).query(self.points_m[rest])
+        ray = self.points_m[rest] - self.eye_m
+        step = self.points_m[members][nearest] - self.points_m[rest]
+        aside = np.linalg.norm(np.cross(step, ray), axis=1) / np.linalg.norm(ray, axis=1)
+        near = (gaps <= 3 * self.radius_m) & (aside <= 1.5 * self.radius_m)
         count, close = (np.bincount(parts[rest], weights) for weights in (None, near))
         piece = (close > 0) & ((count < self.config.min_points) | (close >= 0.9 * count))
         grown = members.copy()
@@ -284,11 +303,11 @@ class Surroundings:
         filled[edges] = members[nearest]
         return filled
 
-    def _alike(self, seeds: Int[np.ndarray, " s"]) -> Bool[np.ndarray, " n"]:
-        """Return the points in the color of the seeds under any light."""
+    def _difference(self, seeds: Int[np.ndarray, " s"]) -> Float[np.ndarray, " n"]:
+        """Return the difference of each point's color from the seeds' under any light."""
         own = np.median(self.colors[seeds[:MAX_SEEDS]], axis=0)
         light = (self.colors @ own) / max(float(own @ own), 1.0)
-        return np.linalg.norm(self.colors - light[:, None] * own, axis=1) < self.config.color_levels
+        return np.linalg.norm(self.colors - light[:, None] * own, axis=1)
 
 
 def things_without_id(
