@@ -34,6 +34,8 @@ MAX_OBJECTS = 4
 """Maximum number of objects that hands move in one clip."""
 MIN_MOTION = 0.015
 """Minimum displacement of a moved corner, in image widths."""
+START_MOTION = 0.05
+"""Displacement of an object up to which it begins to move, in image widths."""
 MIN_CORNERS = 6
 """Minimum number of corners of an object, and of an object that is found again in a frame."""
 MAX_HAND_DISTANCE = 1.5
@@ -55,6 +57,8 @@ class Moved:
     """Pixels of the object in each frame, also where a hand may be in front of it."""
     motion_px: Float[np.ndarray, "f 2 3"]
     """Affine transform of pixels (column, row, 1) from the first frame to each frame."""
+    contacts: tuple[tuple[int, int], ...]
+    """Frames in which it begins to move, each with the side of the hand at it."""
     worn: bool
     """True if it continues to the border of the image, as a sleeve does."""
 
@@ -103,7 +107,10 @@ def find_moved(
         held &= ~grown(shown.any(axis=0), 3)[row, column]  # an object that passes drags corners
         if first.sum() >= MIN_CORNERS**2:
             worn = _touches_border(first) and bool((first & grown(hidden[0], 5)).any())
-            found.append(Moved(first=first, shown=shown, motion_px=motion, worn=worn))
+            contacts = _contacts(start, motion, hands, width)
+            found.append(
+                Moved(first=first, shown=shown, motion_px=motion, contacts=contacts, worn=worn)
+            )
     return found
 
 
@@ -278,6 +285,29 @@ def _carried(
             shift = (now[PALM] - before[PALM]).mean(axis=0)
             return motion + np.array([[0, 0, shift[0]], [0, 0, shift[1]]])
     return motion
+
+
+def _contacts(
+    start: Float32[np.ndarray, "n 2"],
+    motion: Float[np.ndarray, "f 2 3"],
+    hands: HandTracks,
+    width: int,
+) -> tuple[tuple[int, int], ...]:
+    """Return the frames around the start of a motion, each with the side of the nearest hand."""
+    places = np.stack([move(matrix, start) for matrix in motion])
+    shift = np.linalg.norm(places - start, axis=-1).mean(axis=1) / width
+    first = int(np.argmax(shift > MIN_MOTION))
+    later = shift[first:] > START_MOTION
+    last = first + (int(np.argmax(later)) if later.any() else len(later))
+    found = []
+    for frame in range(max(0, first - 2), max(last, first + 1)):
+        apart = [
+            np.linalg.norm(joints[:, None] - places[frame], axis=-1).min()
+            for joints in hands.joints_px[frame]
+        ]
+        if np.isfinite(apart).any():
+            found.append((frame, int(np.nanargmin(apart))))
+    return tuple(found)
 
 
 def _touches_border(mask: Bool[np.ndarray, "h w"]) -> bool:

@@ -68,10 +68,12 @@ def test_a_prior_that_is_worse_than_the_first_frame_is_refused():
 
 @pytest.mark.parametrize("rung", ["static", "rotation"])
 def test_the_prior_of_a_fixed_camera_is_checked_too(rung):
+    exact, coarse = {"psnr_drawn": 100.0}, {"psnr_drawn": 27.5}
+    wrong = {"psnr_background": 27.0, "psnr_first_frame": 30.0}
     with pytest.raises(RefusedError, match=r"-3\.0 dB .*\(--min-prior-gain\)"):
-        check_prior(rung, {"psnr_background": 27.0, "psnr_first_frame": 30.0}, config())
-    check_prior(rung, {"psnr_background": 36.0, "psnr_first_frame": 60.0}, config())
-    changing = {"psnr_background": 12.0, "psnr_first_frame": 12.0}
+        check_prior(rung, wrong | exact, config())
+    check_prior(rung, wrong | coarse, config())  # as well as the points can draw it
+    changing = {"psnr_background": 12.0, "psnr_first_frame": 12.0} | exact
     with pytest.raises(RefusedError, match=r"12\.0 dB, below 16 dB.*a screen.*--rung"):
         check_prior(rung, changing, config())
     check_prior("incremental", changing, config())
@@ -96,7 +98,7 @@ def test_moved_objects_get_ids_and_sleeves_are_arms(tmp_path, monkeypatch):
     shown[1, :, 30:40, 30:40] = True
     shown[2, :, 40:48, 0:20] = True
     found = [
-        Moved(first=mask[0], shown=mask, motion_px=np.zeros((9, 2, 3)), worn=n == 2)
+        Moved(first=mask[0], shown=mask, motion_px=np.zeros((9, 2, 3)), contacts=(), worn=n == 2)
         for n, mask in enumerate(shown)
     ]
     monkeypatch.setattr("egosim_jax.perception.moved.find_moved", lambda *_: found)
