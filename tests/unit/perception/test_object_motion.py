@@ -6,7 +6,6 @@ import pytest
 from egosim_jax.perception.object_motion import (
     TrackObjects,
     _support_plane,
-    complete_hand,
     fall,
     object_model,
 )
@@ -107,14 +106,3 @@ def test_other_objects_do_not_fall(options):
     np.testing.assert_array_equal(
         fall(carried(**options), OTHERS, FPS).path, carried(**options).path
     )
-
-
-def test_a_hand_rests_where_it_enters_and_leaves_and_is_interpolated_in_between():
-    joints = np.full((8, 3, 3), np.nan)
-    for frame in (2, 3, 5):
-        joints[frame] = frame
-    complete = complete_hand(joints)
-    assert complete is not None
-    assert complete[:, 0, 0].tolist() == [2, 2, 2, 3, 4, 5, 5, 5]
-    joints[3] = np.nan
-    assert complete_hand(joints) is None
