@@ -71,6 +71,8 @@ class Record:
     """Names of object instances."""
     moved_ids: Int[np.ndarray, " n"] | None = None
     """Object instances that hands move."""
+    contacts: Int[np.ndarray, "c 3"] | None = None
+    """Frame, side of the hand and object where a hand touches an object to move it."""
     estimate: CameraEstimate | None = None
     """Cameras and the verdict about them; in meters after the stage `scale`."""
     depth: DepthEstimate | None = None

@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int32, UInt8
+from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
 from egosim_jax.annotate.config import AnnotateConfig, Estimators
 from egosim_jax.annotate.prepare import RefusedError
@@ -37,8 +37,6 @@ MOVED = "moved object"
 """Name of an object that a hand moves, if no network names it."""
 MIN_FIXED_DB = 16.0
 """Minimum PSNR of the background if the camera stays in its place, in decibels."""
-GOOD_DB = 35.0
-"""PSNR above which the background of a camera that stays in its place need not improve."""
 PLATE_MARGIN = 1 / 80
 """Width of the border around hands that is replaced, too, as a fraction of the image width."""
 FRAMES_AT_ONCE = 64
@@ -47,11 +45,10 @@ FRAMES_AT_ONCE = 64
 
 def find_scale(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
     """Convert cameras, depth and joints to meters; note the scale, its source and uncertainty."""
-    from egosim_jax.perception.hands import lift
     from egosim_jax.perception.scale import Scale, estimate_scale, scale_cameras, scale_depth
 
     estimate, depth = record.require("estimate"), record.require("depth")
-    joints = None if record.hands is None else lift(record.hands, record.cameras.intrinsics_px)
+    joints = None if record.hands is None else _lifted(record)
     still = depth.metric and not estimate.metric and estimate.points is None
     if still and config.scale is None:
         scale = Scale(
@@ -78,6 +75,39 @@ def find_scale(record: Record, estimators: Estimators, config: AnnotateConfig) -
     return replace(record, joints_m=joints_in_world(record))
 
 
+def _lifted(record: Record) -> Float[np.ndarray, "f 2 21 3"]:
+    """Return the hands in meters, in the camera of each frame."""
+    from egosim_jax.perception.hands import lift, steady
+
+    return steady(lift(record.require("hands"), record.cameras.intrinsics_px), record.fps)
+
+
+def refine_scale(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
+    """Scale the scene so that fingertips have the depth of the objects that they start to move.
+
+    This replaces a scale from hands that may have touched the scene at any time.
+    """
+    from egosim_jax.perception.scale import contact_scale, scale_cameras
+
+    contacts, joints_m = record.require("contacts"), record.joints_m
+    if record.notes["scale"]["source"] != "hands" or joints_m is None or not len(contacts):
+        return record
+    depth = record.require("depth")
+    scale = contact_scale(
+        record.cameras, depth.depth_m[0], record.require("object_ids")[0], _lifted(record), contacts
+    )
+    if scale is None:
+        return record
+    factor = scale.meters_per_unit
+    total = factor * record.notes["scale"]["meters_per_unit"]
+    record = record.add(
+        "scale", {**asdict(scale), "meters_per_unit": total},
+        estimate=scale_cameras(record.require("estimate"), scale),
+        depth=replace(depth, depth_m=(depth.depth_m * factor).astype(np.float32)),
+    )  # fmt: skip
+    return replace(record, joints_m=joints_in_world(record))
+
+
 def _sparse_depth(record: Record) -> DepthEstimate:
     """Return the triangulated points as sparse depth of the first frame, in camera units."""
     estimate = record.require("estimate")
@@ -93,7 +123,7 @@ def _sparse_depth(record: Record) -> DepthEstimate:
 
 
 def find_moved_objects(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
-    """Add `moved_ids`, and their pixels and names: the objects that hands move in the clip.
+    """Add `moved_ids` with pixels and names, and `contacts`: the objects that hands move.
 
     An object that a network segmented keeps its id. A sleeve counts as an arm.
     """
@@ -105,6 +135,7 @@ def find_moved_objects(record: Record, estimators: Estimators, config: AnnotateC
         depth_m = record.require("depth").depth_m[0]
         found = find_moved(record.frames, record.moving, record.hands, record.cameras, depth_m)
     numbers: list[int] = []
+    contacts: list[tuple[int, int, int]] = []
     for moved in found:
         known, count = np.unique(ids[0][moved.first], return_counts=True)
         number = int(known[count.argmax()])
@@ -114,10 +145,14 @@ def find_moved_objects(record: Record, estimators: Estimators, config: AnnotateC
             number = max(int(ids.max()), *names, 0) + 1
             names[number] = MOVED if MOVED not in names.values() else f"{MOVED} {number}"
         ids[moved.shown & (ids == 0)] = number
-        numbers += [number] * (number > 0)
+        if number > 0:
+            numbers.append(number)
+            contacts += [(frame, side, number) for frame, side in moved.contacts]
     notes = {"moved": {number: int((ids[0] == number).sum()) for number in numbers}}
-    moved_ids = np.array(numbers, np.int32)
-    return record.add("objects", notes, object_ids=ids, names=names, moved_ids=moved_ids)
+    return record.add(
+        "objects", notes, object_ids=ids, names=names, moved_ids=np.array(numbers, np.int32),
+        contacts=np.array(contacts, np.int32).reshape(-1, 3),
+    )  # fmt: skip
 
 
 def clean_first_frame(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
@@ -262,12 +297,14 @@ def to_triplet(record: Record, config: AnnotateConfig) -> tuple[Triplet, dict[st
     )
     # Not the mask: its observed region is wider than the points.
     judged = drawn & ~record.moving & ~record.moved
+    drawn_first = _psnr(prior[:1], record.frames[:1], judged[:1])
     judged[0] = False
     first = np.broadcast_to(record.frames[0], record.frames.shape)
     return triplet, {
         "seen": float((mask == 0).mean()),
         "psnr_background": _psnr(prior, record.frames, judged),
         "psnr_first_frame": _psnr(first, record.frames, judged),
+        "psnr_drawn": drawn_first,
     }
 
 
@@ -320,7 +357,9 @@ def check_prior(rung: Rung, figures: Mapping[str, float], config: AnnotateConfig
     """
     fixed = rung in ("static", "rotation")  # the prior is the first frame itself, at most turned
     shown, first = figures["psnr_background"], figures["psnr_first_frame"]
-    gain = shown - (min(first, GOOD_DB) if fixed else first)
+    if fixed:  # the points do not draw the first frame exactly
+        first = -10 * np.log10(10 ** (-first / 10) + 10 ** (-figures["psnr_drawn"] / 10))
+    gain = shown - first
     limit = config.cutting.quality.min_prior_gain_db
     if gain < limit:
         raise RefusedError(
@@ -347,7 +386,8 @@ STAGES = (
     Stage("lens", undistort_clip),
     Stage("depth", find_depth, ("depth",)),
     Stage("scale", find_scale),
-    Stage("objects", find_moved_objects, ("object_ids", "names", "moved_ids")),
+    Stage("objects", find_moved_objects, ("object_ids", "names", "moved_ids", "contacts")),
+    Stage("contact", refine_scale),
     Stage("plate", clean_first_frame, ("first_frame",)),
     Stage("scene", build_state),
     Stage("caption", add_caption, ("prompt",)),

@@ -1,7 +1,7 @@
 """First stages of an annotation: hands, silhouettes, cameras, lens and depth (then `scene`).
 
-    hands -> silhouettes -> cameras -> lens -> depth -> scale -> objects -> plate -> scene
-    -> caption
+    hands -> silhouettes -> cameras -> lens -> depth -> scale -> objects -> contact -> plate
+    -> scene -> caption
 
 A stage is a function of the record so far, the estimators and the configuration. It returns the
 record with additional fields, and notes on its choices and their reasons. Recorded cameras, hands,
@@ -406,12 +406,12 @@ def _camera_notes(estimate: CameraEstimate, focal_source: str) -> dict[str, Any]
 
 def joints_in_world(record: Record) -> np.ndarray:
     """Return the world joints in meters: recorded, or lifted from pixels."""
-    from egosim_jax.perception.hands import lift
+    from egosim_jax.perception.hands import lift, steady
 
     given = record.recording.joints_m
     if given is not None:
         return given[record.source_frames].astype(float)
     cameras = record.cameras
-    local = lift(record.require("hands"), cameras.intrinsics_px)
+    local = steady(lift(record.require("hands"), cameras.intrinsics_px), record.fps)
     poses = rearrange(cameras.world_from_camera, "f a b -> f 1 a b")
     return transform(poses, local)

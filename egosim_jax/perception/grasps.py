@@ -14,7 +14,7 @@ from functools import cached_property
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from egosim_jax.geometry import hinge_rotation, umeyama
 from egosim_jax.perception.silhouettes import PALM
@@ -24,6 +24,10 @@ TIPS: dict[Kind, list[int]] = {"human": [4, 8, 12], "robot": [1, 2]}
 """Grasping joints: tips of thumb, index and middle finger; both jaws of a gripper."""
 MIN_HELD = 2
 """Minimum number of frames between a grasp and a release."""
+MAX_NOISE = 0.25
+"""Maximum noise of the opening, as its median second difference in tolerances of a hold."""
+MAX_ENDS = 24
+"""Maximum number of frames at which a hold may begin or end if the opening is no evidence."""
 MIN_ARC_DEG = 25.0
 """Minimum angle of an arc, in degrees; a shorter arc does not determine its axis."""
 MAX_ARC_ERROR = 0.05
@@ -58,10 +62,16 @@ class Grip:
         tolerance_m: float,
         radius_m: float,
     ) -> Grip:
-        """Return the grip of a hand whose opening changes by at most a tolerance in a hold."""
-        tips = joints_m[:, TIPS[kind]]
-        holds, sure = find_holds(tips, tolerance_m)
-        palm = joints_m[:, PALM[kind]]
+        """Return the grip of a hand whose opening changes by at most a tolerance in a hold.
+
+        Missing frames are completed (`complete_hand`), and a hold is within the frames in between.
+        """
+        seen = seen_frames(joints_m)
+        joints_m = complete_hand(joints_m, seen)
+        tips, palm = joints_m[:, TIPS[kind]], joints_m[:, PALM[kind]]
+        first = int(seen[0])
+        holds, sure = find_holds(tips[first : int(seen[-1]) + 1], tolerance_m)
+        holds = [(grasped + first, released + first) for grasped, released in holds]
         return cls(palm_m=palm, tips_m=tips, holds=holds, sure=sure, radius_m=radius_m)
 
     @property
@@ -84,6 +94,25 @@ class Grip:
         return self.sure and is_between(points_m, self.tips_m[grasped], self.radius_m)
 
 
+def seen_frames(joints_m: Float[np.ndarray, "f j 3"]) -> Int[np.ndarray, " k"]:
+    """Return the frames with a hand."""
+    return np.flatnonzero(np.isfinite(joints_m).all(axis=(1, 2)))
+
+
+def complete_hand(
+    joints_m: Float[np.ndarray, "f j 3"], seen: Int[np.ndarray, " k"]
+) -> Float[np.ndarray, "f j 3"]:
+    """Return a hand that is interpolated between the frames in which it is seen.
+
+    Before it enters and after it leaves the view, it rests where it was seen.
+    """
+    if len(seen) == len(joints_m):
+        return joints_m
+    flat, frames = joints_m.reshape(len(joints_m), -1), np.arange(len(joints_m))
+    complete = [np.interp(frames, seen, values) for values in flat[seen].T]
+    return np.stack(complete, axis=1).reshape(joints_m.shape)
+
+
 def find_holds(
     tips_m: Float[np.ndarray, "f j 3"], tolerance_m: float
 ) -> tuple[list[tuple[int, int]], bool]:
@@ -92,12 +121,15 @@ def find_holds(
     A held object keeps the fingertips at a constant distance. A hold begins when the hand closes,
     or at the first frame, and ends when it opens, or at the last frame. A hand that never closes
     may have held an object while its opening was steady. If the opening is always or never steady,
-    it is no evidence, and any two frames may be a hold.
+    or has noise as in a video, it is no evidence, and any two frames may be a hold: any two of some
+    frames of a long clip.
     """
     opening = np.linalg.norm(tips_m[:, 0] - tips_m[:, 1:].mean(axis=1), axis=-1)
     pairs = [(g, r) for g, r in combinations(range(len(tips_m)), 2) if r - g >= MIN_HELD]
-    if np.ptp(opening) <= tolerance_m:
-        return pairs, False
+    noise = np.median(np.abs(np.diff(opening, 2))) if len(opening) > MIN_HELD else 0.0
+    if np.ptp(opening) <= tolerance_m or noise > MAX_NOISE * tolerance_m:
+        ends = set(np.linspace(0, len(opening) - 1, MAX_ENDS).astype(int).tolist())
+        return [pair for pair in pairs if ends.issuperset(pair)], False
     steady = [(g, r) for g, r in pairs if np.ptp(opening[g : r + 1]) <= tolerance_m]
     longest = [(g, r) for g, r in steady if (g - 1, r) not in steady and (g, r + 1) not in steady]
     padded = np.pad(opening, 1, constant_values=np.inf)  # may hold from frame 0 on

@@ -34,6 +34,8 @@ MAX_OBJECTS = 4
 """Maximum number of objects that hands move in one clip."""
 MIN_MOTION = 0.015
 """Minimum displacement of a moved corner, in image widths."""
+START_MOTION = 0.05
+"""Displacement of an object up to which it begins to move, in image widths."""
 MIN_CORNERS = 6
 """Minimum number of corners of an object, and of an object that is found again in a frame."""
 MAX_HAND_DISTANCE = 1.5
@@ -55,6 +57,8 @@ class Moved:
     """Pixels of the object in each frame, also where a hand may be in front of it."""
     motion_px: Float[np.ndarray, "f 2 3"]
     """Affine transform of pixels (column, row, 1) from the first frame to each frame."""
+    contacts: tuple[tuple[int, int], ...]
+    """Frames in which it begins to move, each with the side of the hand at it."""
     worn: bool
     """True if it continues to the border of the image, as a sleeve does."""
 
@@ -103,7 +107,10 @@ def find_moved(
         held &= ~grown(shown.any(axis=0), 3)[row, column]  # an object that passes drags corners
         if first.sum() >= MIN_CORNERS**2:
             worn = _touches_border(first) and bool((first & grown(hidden[0], 5)).any())
-            found.append(Moved(first=first, shown=shown, motion_px=motion, worn=worn))
+            contacts = _contacts(start, motion, hands, width)
+            found.append(
+                Moved(first=first, shown=shown, motion_px=motion, contacts=contacts, worn=worn)
+            )
     return found
 
 
@@ -192,17 +199,23 @@ def _always_on(tracks: _Tracks, motion: Float[np.ndarray, "f 2 3"]) -> Bool[np.n
 def _similarity(
     start: Float[np.ndarray, "n 2"], end: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, "2 3"] | None, Bool[np.ndarray, " n"]]:
-    """Return the similarity transform of most points (RANSAC), and the points that follow it."""
+    """Return the similarity transform of most points (RANSAC), and the points that follow it.
+
+    Points whose end is NaN are not known. The transform is None if too few points follow it.
+    """
     import cv2
 
-    if len(start) < MIN_CORNERS:
-        return None, np.zeros(len(start), bool)
+    known = np.flatnonzero(np.isfinite(end).all(axis=1))
+    followers = np.zeros(len(start), bool)
+    if len(known) < MIN_CORNERS:
+        return None, followers
     matrix, inside = cv2.estimateAffinePartial2D(
-        start.astype(np.float64), end.astype(np.float64), ransacReprojThreshold=TOLERANCE_PX
+        start[known].astype(float), end[known].astype(float), ransacReprojThreshold=TOLERANCE_PX
     )
     if matrix is None or inside.sum() < MIN_CORNERS:
-        return None, np.zeros(len(start), bool)
-    return matrix, inside[:, 0] > 0
+        return None, followers
+    followers[known[inside[:, 0] > 0]] = True
+    return matrix, followers
 
 
 def _follow_object(
@@ -213,23 +226,46 @@ def _follow_object(
 ) -> Float[np.ndarray, "f 2 3"]:
     """Return the object's motion in the image from the first frame to each frame.
 
-    Its corners are searched where the last frame's motion predicts them. Where too few are found,
-    it moves with the nearest hand, or rests if no hand is near.
+    The first frame is warped by a guess and its corners are searched near by: the guess is the
+    motion of the corners' tracks, of a hand at the object, or the last frame's motion. Where too
+    few corners are found, the object moves with the hand, or rests if no hand is there.
     """
     motion = np.tile(np.eye(2, 3), (len(places), 1, 1))
-    corners = ((start + 0.5) / video.reduction - 0.5).astype(np.float32)
     for frame in range(1, len(places)):
-        guess = move(motion[frame - 1], start)
-        guess = np.where(np.isfinite(places[frame]), places[frame], guess)
-        there, good = video.follow(0, frame, corners, (guess + 0.5) / video.reduction - 0.5)
-        there = (there + 0.5) * video.reduction - 0.5
-        tracked = np.isfinite(places[frame]).all(axis=1)
-        good, there = good | tracked, np.where(good[:, None], there, places[frame])
-        found, _ = _similarity(start[good], there[good])
-        if found is None:
-            found = _carried(motion[frame - 1], start, hands, frame)
-        motion[frame] = found
+        tracked, _ = _similarity(start, places[frame])
+        carried = _carried(motion[frame - 1], start, hands, frame)
+        for guess in (tracked, carried, motion[frame - 1]):
+            found = None if guess is None else _found_near(video, start, guess, frame)
+            if found is not None:
+                break
+        motion[frame] = next(m for m in (found, tracked, carried) if m is not None)
     return motion
+
+
+def _found_near(
+    video: Background,
+    start: Float32[np.ndarray, "n 2"],
+    guess: Float[np.ndarray, "2 3"],
+    frame: int,
+) -> Float[np.ndarray, "2 3"] | None:
+    """Return the motion to a frame near a guess, by optical flow; None with too few corners."""
+    import cv2
+
+    corners = ((start + 0.5) / video.reduction - 0.5).astype(np.float32)
+    to_work = np.array([[1 / video.reduction] * 2, [(0.5 / video.reduction - 0.5)] * 2])
+    linear = guess[:, :2]
+    shift = to_work[0] * guess[:, 2] + to_work[1] - linear @ to_work[1]
+    scaled = np.concatenate([linear, shift[:, None]], axis=1)
+    size = video.gray[0].shape[::-1]
+    views = [cv2.warpAffine(video.gray[0], scaled, size, borderMode=cv2.BORDER_REPLICATE)]
+    warped = Background(
+        gray=[*views, video.gray[frame]],
+        still=[video.still[0], video.still[frame]],
+        reduction=video.reduction,
+    )
+    there, good = warped.follow(0, 1, move(scaled, corners).astype(np.float32))
+    there = (there + 0.5) * video.reduction - 0.5
+    return _similarity(start[good], there[good])[0]
 
 
 def _carried(
@@ -238,9 +274,7 @@ def _carried(
     hands: HandTracks,
     frame: int,
 ) -> Float[np.ndarray, "2 3"]:
-    """Return the last frame's motion, continued by the motion of a hand at the object."""
-    import cv2
-
+    """Return the last frame's motion, shifted as a hand at the object is."""
     here = move(motion, start)
     for side in range(hands.joints_px.shape[1]):
         before, now = hands.joints_px[frame - 1, side], hands.joints_px[frame, side]
@@ -248,10 +282,32 @@ def _carried(
             continue
         apart = np.linalg.norm(here[:, None] - before[None], axis=-1).min()
         if apart <= MAX_HAND_DISTANCE / 2 * np.ptp(before, axis=0).max():
-            step, _ = cv2.estimateAffinePartial2D(before[PALM], now[PALM], method=cv2.LMEDS)
-            if step is not None:
-                return step @ np.concatenate([motion, [[0, 0, 1]]])
+            shift = (now[PALM] - before[PALM]).mean(axis=0)
+            return motion + np.array([[0, 0, shift[0]], [0, 0, shift[1]]])
     return motion
+
+
+def _contacts(
+    start: Float32[np.ndarray, "n 2"],
+    motion: Float[np.ndarray, "f 2 3"],
+    hands: HandTracks,
+    width: int,
+) -> tuple[tuple[int, int], ...]:
+    """Return the frames around the start of a motion, each with the side of the nearest hand."""
+    places = np.stack([move(matrix, start) for matrix in motion])
+    shift = np.linalg.norm(places - start, axis=-1).mean(axis=1) / width
+    first = int(np.argmax(shift > MIN_MOTION))
+    later = shift[first:] > START_MOTION
+    last = first + (int(np.argmax(later)) if later.any() else len(later))
+    found = []
+    for frame in range(max(0, first - 2), max(last, first + 1)):
+        apart = [
+            np.linalg.norm(joints[:, None] - places[frame], axis=-1).min()
+            for joints in hands.joints_px[frame]
+        ]
+        if np.isfinite(apart).any():
+            found.append((frame, int(np.nanargmin(apart))))
+    return tuple(found)
 
 
 def _touches_border(mask: Bool[np.ndarray, "h w"]) -> bool:

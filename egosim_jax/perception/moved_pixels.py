@@ -22,15 +22,19 @@ COMPARED = 20
 """Number of frames whose colors decide between motion and rest."""
 MIN_CHANGE = 18.0
 """Minimum color change at the first place of a moved object, in 8-bit levels."""
-MAX_CHANGE = 80.0
-"""Color change to which larger ones are clipped; motion explains at most half of it."""
+MAX_CHANGE = 40.0
+"""Maximum color change of a moved object, in 8-bit levels."""
+MAX_LIGHT = 1.35
+"""Maximum ratio of the light on a pixel in two frames."""
+PALETTE = 1000
+"""Approximate number of an object's colors to which hidden pixels are compared."""
 PASSES = 2
 """Number of passes of the segmentation; the first takes the hull of the corners as the object."""
 UNSEEN = 12.0
 """Assumed color change along the motion of a pixel that hands always hide, in 8-bit levels."""
 HAND_MARGIN = 1 / 280
 """Border around hands that is not compared, in image widths."""
-AROUND = 0.5
+AROUND = 2.0
 """Width of the searched border around an object's corners, relative to their extent."""
 
 
@@ -63,7 +67,7 @@ def segment_moved(
     margin = max(1, round(HAND_MARGIN * own.shape[1]))
     hands = [grown(hidden[frame], margin) for frame in (0, *chosen)]
     for _ in range(PASSES):
-        costs, counts = np.zeros((2, 2, len(rows)), np.float32)
+        changes = np.full((2, len(chosen), len(rows)), np.nan, np.float32)
         for n, frame in enumerate(chosen):
             covered = hands[n + 1] | grown(warp(own > 0, motion[frame]), 2)
             for way, hide, places in (
@@ -71,15 +75,15 @@ def segment_moved(
                 (1, hands[n + 1], move(motion[frame], pixels)),
             ):
                 colors, seen = _look_up(smooth[n + 1], hide, places)
-                change = np.abs(colors - expected).max(axis=1)
-                costs[way] += np.where(seen, np.minimum(change, MAX_CHANGE), 0)
-                counts[way] += seen
-        at_rest, moving = costs / np.maximum(counts, 1)
-        moving = np.where(counts[1] > 0, moving, UNSEEN)
+                changes[way, n] = np.where(seen, _change(colors, expected), np.nan)
+        (at_rest, moving), (seen_at_rest, seen_moving) = _medians(changes)
         moves = (at_rest > MIN_CHANGE) & (at_rest > moving + MIN_CHANGE / 2)
-        moves = np.where(counts[0] > 0, moves, own[rows, columns] > 0)
+        moves = np.where(seen_at_rest, moves, own[rows, columns] > 0) & (moving < MAX_CHANGE)
+        moves[moves & ~seen_moving] = _alike(
+            expected[moves & ~seen_moving], expected[moves & seen_moving]
+        )
         own = np.zeros_like(own)
-        own[rows, columns] = moves & (moving < MAX_CHANGE / 2) & ~hands[0][rows, columns]
+        own[rows, columns] = moves & ~hands[0][rows, columns]
         own = _cleaned(own, start)
     return (own > 0) & ~hidden[0]
 
@@ -143,6 +147,38 @@ def _compared(start: Float32[np.ndarray, "n 2"], motion: Float[np.ndarray, "f 2 
         for some in (far, np.flatnonzero(shift >= TOLERANCE_PX))
     ]
     return np.unique(np.concatenate(chosen)).tolist()
+
+
+def _change(
+    colors: Float32[np.ndarray, "n 3"], expected: Float32[np.ndarray, "n 3"]
+) -> Float32[np.ndarray, " n"]:
+    """Return the changes of colors under the best light: shadows and exposure are no change."""
+    light = (colors * expected).sum(axis=1) / np.maximum((colors**2).sum(axis=1), 1)
+    light = np.clip(light, 1 / MAX_LIGHT, MAX_LIGHT)
+    return np.abs(light[:, None] * colors - expected).max(axis=1)
+
+
+def _medians(
+    changes: Float32[np.ndarray, "w f n"],
+) -> tuple[Float32[np.ndarray, "w n"], Bool[np.ndarray, "w n"]]:
+    """Return medians over frames, `UNSEEN` where all are NaN, and True for the other ones."""
+    count = np.isfinite(changes).sum(axis=1)
+    ordered = np.sort(changes, axis=1)  # NaN last
+    middle = np.maximum(count - 1, 0) // 2
+    medians = np.take_along_axis(ordered, middle[:, None], axis=1)[:, 0]
+    return np.where(count > 0, medians, np.float32(UNSEEN)), count > 0
+
+
+def _alike(
+    colors: Float32[np.ndarray, "n 3"], others: Float32[np.ndarray, "m 3"]
+) -> Bool[np.ndarray, " n"]:
+    """Return the colors that are like one of some others."""
+    from scipy.spatial import KDTree
+
+    if not len(colors) or not len(others):
+        return np.zeros(len(colors), bool)
+    some = others[:: max(1, len(others) // PALETTE)]
+    return KDTree(some).query(colors, distance_upper_bound=MIN_CHANGE)[0] < MIN_CHANGE
 
 
 def _look_up(

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from egosim_jax.geometry import UP_AXES, Up, invert, pixels_of, transform, up_of
 from egosim_jax.perception.extent import Candidate, choose_extent, moving_part
-from egosim_jax.perception.grasps import MIN_HELD, Grip, couplings, is_firm
+from egosim_jax.perception.grasps import MIN_HELD, Grip, couplings, is_firm, seen_frames
 from egosim_jax.perception.growth import NEW, Growth, things_without_id
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.perception.pose_refinement import (
@@ -128,17 +128,17 @@ def estimate_object_motion(
     """Return the motions of the objects that hands moved, the new objects' points, and notes.
 
     Each hand moves at most one object. If two hands claim an object, the hand that explains the
-    colors better gets it. `hidden` marks the pixels that hands cover. A hand that is missing from
-    some frames is completed (`complete_hand`). Without an object with an id in its grip, a hand may
-    move a new one: it gets the next free id.
+    colors better gets it. `hidden` marks the pixels that hands cover. A hand may
+    be missing from some frames (`Grip`). Without an object with an id in its grip, a hand may move
+    a new one: it gets the next free id.
     """
     shown = _smooth(clip.frames, config.blur_px)
     found: dict[int, tuple[float, ObjectMotion]] = {}
     new: dict[int, Float32[np.ndarray, "n 3"]] = {}
     notes: list[str] = []
     for hand in range(action.joints_m.shape[1]):
-        joints = complete_hand(action.joints_m[:, hand])
-        if joints is not None:
+        joints = action.joints_m[:, hand]
+        if len(seen_frames(joints)) > MIN_HELD:
             best, note = _best_candidate(joints, action, state, shown, hidden, config)
             if best is not None and best[1].model.number == NEW:
                 change, motion = best
@@ -162,20 +162,6 @@ def estimate_object_motion(
                 if number not in found or change < found[number][0]:
                     found[number] = change, motion
     return [motion for _, motion in found.values()], new, notes
-
-
-def complete_hand(joints_m: Float[np.ndarray, "f j 3"]) -> Float[np.ndarray, "f j 3"] | None:
-    """Return a hand with its missing frames interpolated; None if it is hardly ever there.
-
-    Before it enters and after it leaves the view, it rests where it was seen.
-    """
-    seen = np.flatnonzero(np.isfinite(joints_m).all(axis=(1, 2)))
-    if len(seen) <= MIN_HELD:
-        return None
-    flat = joints_m.reshape(len(joints_m), -1)
-    frames = np.arange(len(flat))
-    complete = [np.interp(frames, seen, values) for values in flat[seen].T]
-    return np.stack(complete, axis=1).reshape(joints_m.shape)
 
 
 def _best_candidate(

@@ -9,7 +9,14 @@ import pytest
 from egosim_jax.annotate.clip import Job, open_record
 from egosim_jax.annotate.frames import Sampling
 from egosim_jax.annotate.prepare import RefusedError
-from egosim_jax.annotate.scene import STAGES, check_prior, join_objects, to_triplet
+from egosim_jax.annotate.scene import (
+    STAGES,
+    check_prior,
+    clean_first_frame,
+    find_moved_objects,
+    join_objects,
+    to_triplet,
+)
 from egosim_jax.annotate.sources import Source, open_source
 from egosim_jax.annotate.stages import (
     drop_flashes,
@@ -19,6 +26,7 @@ from egosim_jax.annotate.stages import (
     visible,
 )
 from egosim_jax.perception.estimates import LEFT, RIGHT
+from egosim_jax.perception.moved import Moved
 from tests.unit.annotate.stubs import StubHands, config, textured_video, write
 
 
@@ -60,10 +68,12 @@ def test_a_prior_that_is_worse_than_the_first_frame_is_refused():
 
 @pytest.mark.parametrize("rung", ["static", "rotation"])
 def test_the_prior_of_a_fixed_camera_is_checked_too(rung):
+    exact, coarse = {"psnr_drawn": 100.0}, {"psnr_drawn": 27.5}
+    wrong = {"psnr_background": 27.0, "psnr_first_frame": 30.0}
     with pytest.raises(RefusedError, match=r"-3\.0 dB .*\(--min-prior-gain\)"):
-        check_prior(rung, {"psnr_background": 27.0, "psnr_first_frame": 30.0}, config())
-    check_prior(rung, {"psnr_background": 36.0, "psnr_first_frame": 60.0}, config())
-    changing = {"psnr_background": 12.0, "psnr_first_frame": 12.0}
+        check_prior(rung, wrong | exact, config())
+    check_prior(rung, wrong | coarse, config())  # as well as the points can draw it
+    changing = {"psnr_background": 12.0, "psnr_first_frame": 12.0} | exact
     with pytest.raises(RefusedError, match=r"12\.0 dB, below 16 dB.*a screen.*--rung"):
         check_prior(rung, changing, config())
     check_prior("incremental", changing, config())
@@ -79,6 +89,29 @@ def test_moved_objects_are_joined_by_other_objects():
     assert (joined[6:, :4] == 4).all()
     assert names == {3: "moved object", 4: "object 4"}
     assert np.count_nonzero(joined) == 20
+
+
+def test_moved_objects_get_ids_and_sleeves_are_arms(tmp_path, monkeypatch):
+    record = stages_of(tmp_path, config(segment=True), last="scale")
+    shown = np.zeros((3, 9, 48, 80), bool)
+    shown[0, :, 9:21, 58:68] = True  # on the cup of the network
+    shown[1, :, 30:40, 30:40] = True
+    shown[2, :, 40:48, 0:20] = True
+    found = [
+        Moved(first=mask[0], shown=mask, motion_px=np.zeros((9, 2, 3)), contacts=(), worn=n == 2)
+        for n, mask in enumerate(shown)
+    ]
+    monkeypatch.setattr("egosim_jax.perception.moved.find_moved", lambda *_: found)
+    settings = config()
+    record = find_moved_objects(record, settings.build(), settings)
+    ids = record.require("object_ids")
+    assert ids[4, 15, 65] == ids[4, 9, 58] == 5
+    assert (ids[4, 35, 35], ids[4, 45, 10]) == (6, -1)
+    assert record.names == {5: "cup", 6: "moved object"}
+    assert record.require("moved_ids").tolist() == [5, 6]
+    assert (record.moved == np.isin(ids, [5, 6])).all()
+    record = clean_first_frame(record, settings.build(), settings)
+    assert (record.require("first_frame")[35, 35] == record.frames[0, 35, 35]).all()
 
 
 def test_a_second_hand_for_a_moment_is_the_first_one_again():
