@@ -80,7 +80,8 @@ class Surroundings:
         """Return the surroundings of a hand from the chosen points of a state."""
         points, colors = state.points_m[chosen], state.colors[chosen].astype(np.float32)
         up = np.array(UP_AXES[up_of(state)])
-        surfaces = support_planes(points, up)
+        looks_down = up_of(state) == "-y"  # the first camera's own axis, far from the vertical
+        surfaces = support_planes(points, up, eye_m=eye_m if looks_down else None)
         plane = surfaces[0].plane if surfaces else np.array([*up, np.nan])
         heights = points @ plane[:3] + plane[3]
         near = np.abs(heights)

@@ -199,7 +199,7 @@ def _best_candidate(
             )
     if things and grip.sure and not found:
         note = "closed on something without an id that the clip shows at rest"
-    return min(found, key=lambda candidate: candidate[0], default=None), note
+    return min(found, key=lambda candidate: candidate[0], default=None), "" if found else note
 
 
 def _best_motion(
