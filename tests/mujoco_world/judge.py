@@ -4,11 +4,12 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from egosim_jax.geometry import transform
 from egosim_jax.perception import Perception
 from egosim_jax.state.depth import state_from_depth
-from egosim_jax.state.fuse import fuse
+from egosim_jax.state.fuse import REPLACE_M, fuse
 from egosim_jax.types import SceneState
 from tests.mujoco_world.world import Film
 
@@ -87,6 +88,7 @@ def judge(film: Film, perception: Perception, ids: Ids) -> Verdict:
         _nearest(np.linalg.norm(fused.points_m[known] - wanted[source], axis=1), source, len(index))
         for wanted in (places, starts)
     )
+    error = _inherit(error, starts, owners)
     target, scenery = owners == film.target_id, owners == 0
     others = ~target & ~scenery
     gone = np.linalg.norm(places - starts, axis=1) > MOVED_M
@@ -116,3 +118,18 @@ def _nearest(distances: np.ndarray, source: np.ndarray, count: int) -> np.ndarra
     nearest = np.full(count, np.inf)
     np.minimum.at(nearest, source, distances)
     return nearest
+
+
+def _inherit(error: np.ndarray, starts: np.ndarray, owners: np.ndarray) -> np.ndarray:
+    """Give a point that a new one replaced the error of its nearest neighbor that is left.
+
+    A new point replaces all within `REPLACE_M`, and carries the color of one of them.
+    """
+    found = error.copy()
+    for number in np.unique(owners):
+        (lost,) = np.nonzero((owners == number) & np.isinf(error))
+        (kept,) = np.nonzero((owners == number) & np.isfinite(error))
+        if len(lost) and len(kept):
+            gaps, nearest = KDTree(starts[kept]).query(starts[lost])
+            found[lost] = np.where(gaps <= REPLACE_M, error[kept[nearest]], np.inf)
+    return found
