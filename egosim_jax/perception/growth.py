@@ -221,7 +221,8 @@ class Surroundings:
     def with_crumbs(self, members: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """Return an object's points with the pieces beside it that are too small for an object.
 
-        Such pieces are a seam along its edge, whose points mix two colors, or single points.
+        Such pieces are a seam along its edge, whose points mix two colors or, where the surface
+        turns away from the camera, are far behind each other.
         """
         from scipy.spatial import KDTree
 
@@ -229,8 +230,11 @@ class Surroundings:
         (rest,) = np.nonzero(~members)
         if not len(rest):
             return members
-        gaps = KDTree(self.points_m[members]).query(self.points_m[rest])[0]
-        near = gaps <= 1.5 * self.radius_m
+        gaps, nearest = KDTree(self.points_m[members]).query(self.points_m[rest])
+        ray = self.points_m[rest] - self.eye_m
+        step = self.points_m[members][nearest] - self.points_m[rest]
+        aside = np.linalg.norm(np.cross(step, ray), axis=1) / np.linalg.norm(ray, axis=1)
+        near = (gaps <= 3 * self.radius_m) & (aside <= 1.5 * self.radius_m)
         count, close = (np.bincount(parts[rest], weights) for weights in (None, near))
         piece = (close > 0) & ((count < self.config.min_points) | (close >= 0.9 * count))
         grown = members.copy()

@@ -308,7 +308,9 @@ def fall(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"], fps: int) -
     if ((end - first) @ up).mean() < MIN_LIFT_M:
         return motion
     # Not the clearance alone: only the visible side has points, so it is not 0 on the ground.
-    gap = _clearance(end, others_m, up, floor) - _clearance(first, others_m, up, floor)
+    # Before the grasp, points above the object's lowest ones are beside it, or left of it.
+    under = others_m[others_m @ up < np.quantile(first @ up, 0.02) + FOOTPRINT_M]
+    gap = _clearance(end, others_m, up, floor) - _clearance(first, under, up, floor)
     seconds = np.maximum(np.arange(last + 1) - released, 0) / fps
     drop = np.minimum(GRAVITY / 2 * seconds**2, max(gap, 0.0))
     path = motion.path.copy()
