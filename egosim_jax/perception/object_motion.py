@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from egosim_jax.geometry import UP_AXES, Up, invert, pixels_of, transform, up_of
-from egosim_jax.perception.extent import choose_extent
+from egosim_jax.perception.extent import choose_extent, moving_part
 from egosim_jax.perception.grasps import Grip, couplings
 from egosim_jax.perception.growth import NEW, Growth, things_without_id
 from egosim_jax.perception.pipeline import Observation
@@ -73,6 +73,8 @@ class TrackObjects:
     """Sigma of the Gaussian blur of the clip: generated frames are softer than points."""
     growth: Growth = field(default_factory=Growth)
     """Segmentation of an object without an id."""
+    part: float = 0.9
+    """Maximum size of a moving part, as a fraction of the whole connected thing."""
     color: ColorCost = field(default_factory=ColorCost)
     """Comparison of the clip's colors with the predicted colors."""
     refinement: Refinement = field(
@@ -187,19 +189,24 @@ def _best_candidate(
         return min(found, key=lambda candidate: candidate[0], default=None), ""
     things, note = things_without_id(grip, action.cameras, state, config.growth)
     for growths in things:
-        moved = [
+        tried = [
             _best_motion(model, grip, 1.0, action.cameras, shown, hidden, config)
             for model in growths
         ]
-        moved = [best for best in moved if best is not None]
+        moved = [best for best in tried if best is not None]
         if moved:
+            part = moving_part(moved[0][1], action.cameras, shown, hidden, config.color)
+            if config.min_points <= len(part.points_m) < config.part * len(growths[0].points_m):
+                best = _best_motion(part, grip, 1.0, action.cameras, shown, hidden, config)
+                moved += [best] if best else []
             motions = [motion for _, motion in moved]
-            found.append(
-                moved[choose_extent(motions, action.cameras, state, shown, hidden, config.color)]
-            )
-    if things and grip.sure and not found:
+            scene = action.cameras, state, shown, hidden, config.color
+            found.append(moved[choose_extent(motions, growths[0], *scene)])
+    if found:
+        return min(found, key=lambda candidate: candidate[0]), ""
+    if things and grip.sure:
         note = "closed on something without an id that the clip shows at rest"
-    return min(found, key=lambda candidate: candidate[0], default=None), "" if found else note
+    return None, note
 
 
 def _best_motion(

@@ -106,7 +106,7 @@ def test_a_stacked_object_of_the_same_color_ends_at_the_concave_edge():
     grip = closed_on((-0.025, 0, 0.07), (0.025, 0, 0.07))
     sizes = [growth[RED] for growth in grown(scene(below, above), grip)]
     assert sizes[0] > 0.9 * len(below[0])
-    assert any(0.7 * len(above[0]) < size < 1.2 * len(above[0]) for size in sizes)
+    assert any(0.7 * len(above[0]) < size < 1.2 * len(above[0]) for size in sizes), sizes
 
 
 @pytest.mark.parametrize(
