@@ -24,7 +24,9 @@ from egosim_jax.types import Cameras, SceneState
 NEW = 0
 """Number of an object that has no id yet."""
 NEIGHBORS = 16
-"""Number of nearest points that determine a point's normal and its edges."""
+"""Number of nearest points that determine a point's normal."""
+HOLLOW = 0.15
+"""Minimum fraction of concave pairs of a point at a concave edge."""
 MAX_SEEDS = 20
 """Maximum number of points between the fingertips that give an object's color."""
 MIN_HEIGHT_M = 0.002
@@ -44,7 +46,7 @@ class Growth:
     spacings: float = 2.5
     """Maximum distance of connected points, in median distances of nearest points."""
     concave: float = 0.2
-    """Height of neighbors above a point's tangent plane at a concave edge, per distance."""
+    """Height of a point above a neighbor's tangent plane at a concave edge, per distance."""
     edge_deg: float = 25.0
     """Angle between the normals of neighbors at an edge, in degrees."""
     color_levels: float = 45.0
@@ -123,18 +125,33 @@ class Surroundings:
         return np.where(inward[:, None], -normals, normals)
 
     @cached_property
-    def hollow(self) -> Bool[np.ndarray, " n"]:
-        """Points at a concave edge: the points around them are above their tangent planes."""
-        steps = self.points_m[self.neighbors[:, 1:]] - self.points_m[:, None]
-        rise = np.einsum("nki,ni->nk", steps, self.normals).mean(axis=1)
-        return rise > self.config.concave * np.linalg.norm(steps, axis=2).mean(axis=1)
-
-    @cached_property
     def pairs(self) -> Int[np.ndarray, "p 2"]:
         """Pairs of connected points."""
         from scipy.spatial import KDTree
 
         return KDTree(self.points_m).query_pairs(self.radius_m, output_type="ndarray")
+
+    @cached_property
+    def bends(self) -> Float[np.ndarray, "p 3"]:
+        """Difference of the normals of each pair."""
+        one, other = self.pairs.T
+        return self.normals[one] - self.normals[other]
+
+    @cached_property
+    def concave(self) -> Bool[np.ndarray, " p"]:
+        """Pairs across a concave edge: each point is above the other's tangent plane."""
+        one, other = self.pairs.T
+        steps = self.points_m[other] - self.points_m[one]
+        rise = (self.bends * steps).sum(axis=1) / 2
+        return rise > self.config.concave * np.linalg.norm(steps, axis=1)
+
+    @cached_property
+    def hollow(self) -> Bool[np.ndarray, " n"]:
+        """Points at a concave edge."""
+        count = len(self.points_m)
+        every = np.bincount(self.pairs.ravel(), minlength=count)
+        concave = np.bincount(self.pairs[self.concave].ravel(), minlength=count)
+        return concave > HOLLOW * every
 
     def parts(
         self, members: Bool[np.ndarray, " n"], cut: Bool[np.ndarray, " p"] | None = None
@@ -191,13 +208,8 @@ class Surroundings:
     ) -> Iterator[Bool[np.ndarray, " n"]]:
         """Yield the points of the possible objects around seeds in a part, the largest first."""
         flat = whole & ~self.hollow
-        one, other = self.pairs.T
-        bend = self.normals[one] - self.normals[other]
-        steps = self.points_m[other] - self.points_m[one]
-        rise = (bend * steps).sum(axis=1) / 2
-        concave = rise > self.config.concave * np.linalg.norm(steps, axis=1)
-        sharp = np.linalg.norm(bend, axis=1) > np.radians(self.config.edge_deg)
-        convex = self._fill(self._around(seeds, self.parts(flat, concave)), whole)
+        sharp = np.linalg.norm(self.bends, axis=1) > np.radians(self.config.edge_deg)
+        convex = self._fill(self._around(seeds, self.parts(flat, self.concave)), whole)
         alike = self._alike(seeds)
         found: list[Bool[np.ndarray, " n"]] = []
         for members in (
