@@ -24,6 +24,10 @@ TIPS: dict[Kind, list[int]] = {"human": [4, 8, 12], "robot": [1, 2]}
 """Grasping joints: tips of thumb, index and middle finger; both jaws of a gripper."""
 MIN_HELD = 2
 """Minimum number of frames between a grasp and a release."""
+MAX_DEPTH_M = 0.06
+"""Maximum distance of a grip behind the visible side of the gripped object, in meters."""
+FIT_M = 0.01
+"""Distance by which a gripped object may seem wider than the grip, in meters."""
 MIN_ARC_DEG = 25.0
 """Minimum angle of an arc, in degrees; a shorter arc does not determine its axis."""
 MAX_ARC_ERROR = 0.05
@@ -42,12 +46,15 @@ class Grip:
     """True if the hand surely held something."""
     radius_m: float
     """Maximum distance of a gripped point from the line between the fingertips, in meters."""
+    eyes_m: Float[np.ndarray, "f 3"]
+    """Place of the camera in each frame."""
 
     @classmethod
     def of(
         cls,
         joints_m: Float[np.ndarray, "f j 3"],
         kind: Kind,
+        eyes_m: Float[np.ndarray, "f 3"],
         *,
         tolerance_m: float,
         radius_m: float,
@@ -56,7 +63,9 @@ class Grip:
         tips = joints_m[:, TIPS[kind]]
         holds, sure = find_holds(tips, tolerance_m)
         palm = joints_m[:, PALM[kind]]
-        return cls(palm_m=palm, tips_m=tips, holds=holds, sure=sure, radius_m=radius_m)
+        return cls(
+            palm_m=palm, tips_m=tips, holds=holds, sure=sure, radius_m=radius_m, eyes_m=eyes_m
+        )
 
     @property
     def grasps(self) -> list[int]:
@@ -75,7 +84,11 @@ class Grip:
 
     def has(self, points_m: Float[np.ndarray, "n 3"], grasped: int) -> bool:
         """Return True if the hand surely holds an object that has these points at a grasp."""
-        return self.sure and is_between(points_m, self.tips_m[grasped], self.radius_m)
+        tips, eye = self.tips_m[grasped], self.eyes_m[grasped]
+        return self.sure and (
+            is_between(points_m, tips, self.radius_m)
+            or is_behind(points_m, tips, eye, self.radius_m)
+        )
 
 
 def find_holds(
@@ -110,6 +123,34 @@ def is_between(
     share = (points_m - thumb) @ across / max(across @ across, 1e-12)
     away = np.linalg.norm(points_m - thumb - share[:, None] * across, axis=1)
     return bool(((share > 0) & (share < 1) & (away <= radius_m)).any())
+
+
+def is_behind(
+    points_m: Float[np.ndarray, "n 3"],
+    tips_m: Float[np.ndarray, "j 3"],
+    eye_m: Float[np.ndarray, " 3"],
+    radius_m: float,
+) -> bool:
+    """Return True if the line from the thumb to the fingers is inside an object behind its points.
+
+    Only the side of an object that the camera sees has points. The object must fit between the
+    fingertips and fill most of the space.
+    """
+    thumb, fingers = tips_m[0], tips_m[1:].mean(axis=0)
+    opening = max(float(np.linalg.norm(fingers - thumb)), 1e-9)
+    across = (fingers - thumb) / opening
+    ray = eye_m - (thumb + fingers) / 2
+    ray -= (ray @ across) * across
+    ray /= max(float(np.linalg.norm(ray)), 1e-9)
+    along = (points_m - thumb) @ across
+    away = points_m - thumb - along[:, None] * across
+    toward = away @ ray
+    aside = np.linalg.norm(away - toward[:, None] * ray, axis=1)
+    front = along[(aside <= radius_m) & (toward >= 0) & (toward <= MAX_DEPTH_M)]
+    if not len(front):
+        return False
+    fits = front.min() >= -FIT_M and front.max() <= opening + FIT_M
+    return bool(fits and np.ptp(front) >= opening / 2)
 
 
 def palm_motion(palm_m: Float[np.ndarray, "f j 3"], grasped: int) -> Float[np.ndarray, "f 4 4"]:
