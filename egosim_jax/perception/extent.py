@@ -21,8 +21,12 @@ from egosim_jax.types import Cameras, SceneState
 
 FRAMES = 5
 """Number of compared frames, from the grasp to the end."""
-HANDICAP = 1.2
-"""Factor by which each smaller growth must explain the clip better."""
+SMALLER = 0.1
+"""Exponent of a part's relative size in the factor by which it must explain the clip better."""
+WITHOUT_EDGES = 1.2
+"""Factor by which a part without edges must explain the clip better."""
+NOISE = 3.0
+"""Difference from the clip that means nothing, in 8-bit levels."""
 MIN_KNOWN = 0.25
 """Minimum fraction of the covered pixels that can be compared; fewer decide nothing."""
 MARGIN_M = 0.05
@@ -39,21 +43,26 @@ SQUARE = np.ones((3, 3), np.uint8)
 
 def choose_extent(
     motions: Sequence[ObjectMotion],
-    whole: ObjectModel,
+    growths: Sequence[ObjectModel],
     cameras: Cameras,
     state: SceneState,
     shown: Float32[np.ndarray, "f h w 3"],
     hidden: Bool[np.ndarray, "f h w"],
     color: ColorCost,
 ) -> int:
-    """Return the index of the motion whose growth explains the clip best, the largest first.
+    """Return the index of the motion whose part of a thing explains the clip best.
 
-    Each smaller growth must explain it better by a factor: gray frames explain nothing.
+    The thing has some growths, the whole first; a moving part that is none of them has no edges. A
+    smaller growth must explain the clip better, and a part without edges better still: gray frames
+    explain nothing.
     """
     if len(motions) == 1:
         return 0
-    costs = predicted_costs(motions, whole, cameras, state, shown, hidden, color)
-    return int(np.argmin(costs * HANDICAP ** np.arange(len(costs))))
+    costs = predicted_costs(motions, growths[0], cameras, state, shown, hidden, color)
+    sizes = np.array([len(motion.model.points_m) for motion in motions])
+    edged = [any(motion.model is growth for growth in growths) for motion in motions]
+    factors = (len(growths[0].points_m) / sizes) ** SMALLER * np.where(edged, 1.0, WITHOUT_EDGES)
+    return int(np.argmin((costs + NOISE) * factors))
 
 
 def moving_part(

@@ -49,8 +49,8 @@ class Growth:
     """Height of a point above a neighbor's tangent plane at a concave edge, per distance."""
     edge_deg: float = 25.0
     """Angle between the normals of neighbors at an edge, in degrees."""
-    color_levels: float = 45.0
-    """Difference in color, whatever the light, of points of different objects, in 8-bit levels."""
+    color_levels: tuple[float, ...] = (45.0, 18.0)
+    """Differences in color at which growths end, whatever the light, in 8-bit levels."""
     min_points: int = 30
     """Minimum number of points of an object."""
 
@@ -210,13 +210,14 @@ class Surroundings:
         flat = whole & ~self.hollow
         sharp = np.linalg.norm(self.bends, axis=1) > np.radians(self.config.edge_deg)
         convex = self._fill(self._around(seeds, self.parts(flat, self.concave)), whole)
-        alike = self._alike(seeds)
+        difference = self._difference(seeds)
+        alike = [difference < levels for levels in self.config.color_levels]
         found: list[Bool[np.ndarray, " n"]] = []
         for members in (
             whole,
             convex,
-            self._around(seeds, self.parts(whole & alike)),
-            self._around(seeds, self.parts(convex & alike)),
+            *(self._around(seeds, self.parts(whole & same)) for same in alike),
+            *(self._around(seeds, self.parts(convex & same)) for same in alike),
             self._around(seeds, self.parts(flat, sharp)),
         ):
             if members.sum() < self.config.min_points:
@@ -301,11 +302,11 @@ class Surroundings:
         filled[edges] = members[nearest]
         return filled
 
-    def _alike(self, seeds: Int[np.ndarray, " s"]) -> Bool[np.ndarray, " n"]:
-        """Return the points in the color of the seeds under any light."""
+    def _difference(self, seeds: Int[np.ndarray, " s"]) -> Float[np.ndarray, " n"]:
+        """Return the difference of each point's color from the seeds' under any light."""
         own = np.median(self.colors[seeds[:MAX_SEEDS]], axis=0)
         light = (self.colors @ own) / max(float(own @ own), 1.0)
-        return np.linalg.norm(self.colors - light[:, None] * own, axis=1) < self.config.color_levels
+        return np.linalg.norm(self.colors - light[:, None] * own, axis=1)
 
 
 def things_without_id(

@@ -205,7 +205,7 @@ def _best_candidate(
                 moved += [best] if best else []
             motions = [motion for _, motion in moved]
             scene = action.cameras, state, shown, hidden, config.color
-            found.append(moved[choose_extent(motions, growths[0], *scene)])
+            found.append(moved[choose_extent(motions, growths, *scene)])
     if found:
         return min(found, key=lambda candidate: candidate[0]), ""
     if things and grip.sure:
