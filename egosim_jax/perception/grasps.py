@@ -27,7 +27,7 @@ MIN_HELD = 2
 MAX_DEPTH_M = 0.06
 """Maximum distance of a grip behind the visible side of the gripped object, in meters."""
 FIT_M = 0.01
-"""Distance by which a gripped object may seem wider than the grip, in meters."""
+"""Distance by which points may be off on either side of a gripped object, in meters."""
 MIN_ARC_DEG = 25.0
 """Minimum angle of an arc, in degrees; a shorter arc does not determine its axis."""
 MAX_ARC_ERROR = 0.05
@@ -133,8 +133,8 @@ def is_behind(
 ) -> bool:
     """Return True if the line from the thumb to the fingers is inside an object behind its points.
 
-    Only the side of an object that the camera sees has points. The object must fit between the
-    fingertips and fill most of the space.
+    Only the side of an object that the camera sees has points. It must fill most of the space
+    between the fingertips. It may be wider than that, as the base of a cone is, but not by much.
     """
     thumb, fingers = tips_m[0], tips_m[1:].mean(axis=0)
     opening = max(float(np.linalg.norm(fingers - thumb)), 1e-9)
@@ -149,8 +149,9 @@ def is_behind(
     front = along[(aside <= radius_m) & (toward >= 0) & (toward <= MAX_DEPTH_M)]
     if not len(front):
         return False
-    fits = front.min() >= -FIT_M and front.max() <= opening + FIT_M
-    return bool(fits and np.ptp(front) >= opening / 2)
+    slack = opening / 2 + FIT_M
+    fits = front.min() >= -slack and front.max() <= opening + slack
+    return bool(fits and np.ptp(np.clip(front, 0, opening)) >= opening / 2)
 
 
 def palm_motion(palm_m: Float[np.ndarray, "f j 3"], grasped: int) -> Float[np.ndarray, "f 4 4"]:

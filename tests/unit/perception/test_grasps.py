@@ -67,8 +67,24 @@ def test_the_grip_is_a_cylinder_between_thumb_and_fingers(point_cm, between):
 
 @pytest.mark.parametrize(
     ("width_cm", "in_front_cm", "gripped"),
-    [(6, 3, True), (4, 5, True), (2, 3, False), (9, 3, False), (6, 8, False), (6, -2, False)],
-    ids=["its front", "smaller", "too small", "too wide", "too far in front", "behind the grip"],
+    [
+        (6, 3, True),
+        (4, 5, True),
+        (2, 3, False),
+        (10, 3, True),
+        (16, 3, False),
+        (6, 8, False),
+        (6, -2, False),
+    ],
+    ids=[
+        "its front",
+        "smaller",
+        "too small",
+        "wider",
+        "too wide",
+        "too far in front",
+        "behind the grip",
+    ],
 )
 def test_a_grip_is_inside_an_object_behind_its_front(width_cm, in_front_cm, gripped):
     """A camera above sees the top of a box, which the fingers take further down."""
