@@ -41,8 +41,12 @@ SQUARE = np.ones((3, 3), np.uint8)
 """A pixel and its neighbors."""
 
 
+Candidate = tuple[float, ObjectMotion]
+"""Change of the cost by a motion, less the highest accepted one; and the motion."""
+
+
 def choose_extent(
-    motions: Sequence[ObjectMotion],
+    candidates: Sequence[Candidate],
     growths: Sequence[ObjectModel],
     cameras: Cameras,
     state: SceneState,
@@ -50,15 +54,19 @@ def choose_extent(
     hidden: Bool[np.ndarray, "f h w"],
     color: ColorCost,
 ) -> int:
-    """Return the index of the motion whose part of a thing explains the clip best.
+    """Return the index of the candidate whose part of a thing explains the clip best.
 
     The thing has some growths, the whole first; a moving part that is none of them has no edges. A
     smaller growth must explain the clip better, and a part without edges better still: gray frames
-    explain nothing.
+    explain nothing. If too little can be compared, the points of each candidate alone decide.
     """
-    if len(motions) == 1:
+    if len(candidates) == 1:
         return 0
+    motions = [motion for _, motion in candidates]
     costs = predicted_costs(motions, growths[0], cameras, state, shown, hidden, color)
+    if costs is None:
+        changes = np.array([change for change, _ in candidates])
+        costs = changes - changes.min()
     sizes = np.array([len(motion.model.points_m) for motion in motions])
     edged = [any(motion.model is growth for growth in growths) for motion in motions]
     factors = (len(growths[0].points_m) / sizes) ** SMALLER * np.where(edged, 1.0, WITHOUT_EDGES)
@@ -129,11 +137,11 @@ def predicted_costs(
     shown: Float32[np.ndarray, "f h w 3"],
     hidden: Bool[np.ndarray, "f h w"],
     color: ColorCost,
-) -> Float[np.ndarray, " m"]:
+) -> Float[np.ndarray, " m"] | None:
     """Return how far the scene that each motion predicts is from the clip, in 8-bit levels.
 
     Behind the `whole` connected thing is its support. Nobody knows what is behind a part of it, so
-    such pixels are not compared.
+    such pixels are not compared. Without them too few may be left; then the result is None.
     """
     import cv2
 
@@ -159,7 +167,7 @@ def predicted_costs(
         compared &= ~np.stack([cv2.dilate(f.astype(np.uint8), SQUARE) > 0 for f in unknown])
         predicted.append(_closest(np.nan_to_num(drawn), shown))
     if compared.sum() <= MIN_KNOWN * covered.sum():
-        return np.zeros(len(motions))
+        return None
     costs = [color.mean(shown[compared], drawn[compared]) for drawn in predicted]
     return np.array(costs)
 

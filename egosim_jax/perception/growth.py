@@ -196,7 +196,7 @@ class Surroundings:
                 continue
             growths = list(self.grow(seeds[parts[seeds] == part], parts == part))
             small = [g for g in growths if self.extent_m(g) <= self.config.max_extent_m]
-            things[part] = [self.model(self.with_crumbs(members)) for members in small]
+            things[part] = [self.model(members) for members in small]
             if not small:
                 limit = self.config.max_extent_m
                 notes.append(f"closed on something larger than {limit} m: it was not moved")
@@ -213,15 +213,16 @@ class Surroundings:
         difference = self._difference(seeds)
         alike = [difference < levels for levels in self.config.color_levels]
         found: list[Bool[np.ndarray, " n"]] = []
-        for members in (
+        for core in (
             whole,
             convex,
             *(self._around(seeds, self.parts(whole & same)) for same in alike),
             *(self._around(seeds, self.parts(convex & same)) for same in alike),
             self._around(seeds, self.parts(flat, sharp)),
         ):
-            if members.sum() < self.config.min_points:
+            if core.sum() < self.config.min_points:
                 continue
+            members = self.with_crumbs(core)
             if any((members & old).sum() > 0.95 * (members | old).sum() for old in found):
                 continue
             found.append(members)

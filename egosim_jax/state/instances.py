@@ -11,11 +11,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
 from egosim_jax.geometry import pixel_rays
+from egosim_jax.state.depth import known_depth
 from egosim_jax.state.planes import SupportPlane, area_of, fit_plane, support_planes
 from egosim_jax.state.regions import RegionConfig, find_regions
 from egosim_jax.types import SceneState, check_counts
@@ -43,7 +45,10 @@ class ObjectSearch:
     max_extent_m: float = 0.6
     """Maximum extent of an object along each axis, in meters."""
     max_foot_m: float = 0.03
-    """Maximum height of an object's lowest part above what it stands on, in meters."""
+    """Maximum height of an object's lowest visible part above its surface, in meters.
+
+    Half of the object's height is allowed, too: a camera above a ball does not see its lower part.
+    """
     outline_m: float = 0.05
     """Maximum distance of an object from the visible outline of its surface, in meters."""
     min_points: int = 30
@@ -56,6 +61,7 @@ class ObjectSearch:
         check_counts({"max_width": self.max_width, "min_points": self.min_points})
 
 
+@no_type_check  # shapes and dtypes are checked with messages for users
 def find_objects(
     image: UInt8[np.ndarray, "h w 3"],
     depth_m: Float[np.ndarray, "h w"],
@@ -65,10 +71,12 @@ def find_objects(
     """Return the object id of each pixel, from 1 for the largest; 0 is the background.
 
     The image has no hands, and is taken from above the surfaces, by a camera that is not turned on
-    its side. Depth is in meters along the camera's z axis; 0, NaN and infinity mean unknown.
+    its side. Depth is in meters along the camera's z axis; 0, NaN and infinity mean unknown. Raises
+    `InputError` for arrays that `state_from_depth` refuses.
     """
     import cv2
 
+    known_depth(image, depth_m)
     search = search or ObjectSearch()
     every = max(1, -(-max(depth_m.shape) // search.max_width))
     coarse = np.asarray(depth_m[::every, ::every], float)
@@ -207,14 +215,15 @@ def _keep_objects(
     import cv2
 
     numbers, counts = np.unique(labels[labels > 0], return_counts=True)
-    fits = {}
+    fits, standing = {}, set()
     for number, count in zip(numbers.tolist(), counts.tolist(), strict=True):
         own = labels == number
         low, high = np.quantile(heights[own], [0.03, 0.97])
         extent = np.ptp(np.quantile(points[own], [0.02, 0.98], axis=0), axis=0).max()
         if count >= min_pixels and high >= search.min_top_m and extent <= search.max_extent_m:
             fits[number] = low
-    standing = {number for number, low in fits.items() if low <= search.max_foot_m}
+            if low <= max(search.max_foot_m, high / 2):
+                standing.add(number)
     for number in sorted(fits.keys() - standing, key=lambda n: fits[n]):
         own = labels == number
         around = cv2.dilate(own.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0

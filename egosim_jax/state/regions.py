@@ -36,9 +36,9 @@ class RegionConfig:
     color_difference: float = 8.0
     """Minimum difference between the colors of two objects, in units of CIELAB."""
     gap_m: float = 0.012
-    """Maximum distance between two pieces of an object, in meters."""
+    """Maximum distance of a small piece from its object, in meters; half of it for a large one."""
     piece: float = 0.25
-    """Maximum size of a separate piece, as a fraction of the larger one's."""
+    """Maximum size of a small piece, as a fraction of its object's."""
 
 
 class _Sets:
@@ -83,7 +83,7 @@ def find_regions(
     pairs = _neighbors(points[..., 2], candidates, footprint_m, config)
     parts = _by_color(color.reshape(-1, 3), candidates.ravel(), pairs, config)
     parts = _join_surfaces(parts, points, color, pairs, config)
-    parts = _join_pieces(parts, points.reshape(-1, 3), color.reshape(-1, 3), config)
+    parts = _join_pieces(parts, points, color, config)
     return _compact(parts).reshape(candidates.shape)
 
 
@@ -271,28 +271,39 @@ def _normals(
 
 def _join_pieces(
     parts: Int[np.ndarray, " n"],
-    points: Float[np.ndarray, "n 3"],
-    color: Float32[np.ndarray, "n 3"],
+    points: Float[np.ndarray, "h w 3"],
+    color: Float32[np.ndarray, "h w 3"],
     config: RegionConfig,
 ) -> Int[np.ndarray, " n"]:
-    """Join separate small parts with a close larger part of the same color."""
+    """Join each separate part with the closest larger part of the same hue.
+
+    A sliver, such as the side of a box that is seen at a grazing angle, has no color of its own.
+    """
+    import cv2
     from scipy.spatial import KDTree
 
+    height, width = points.shape[:2]
+    kernel = np.ones((3, 3), np.uint8)
+    flat, hues = points.reshape(-1, 3), (color * np.array([0.4, 1, 1])).reshape(-1, 3)
     numbers, counts = np.unique(parts[parts >= 0], return_counts=True)
     order = numbers[np.argsort(-counts, kind="stable")].tolist()
     sizes = dict(zip(numbers.tolist(), counts.tolist(), strict=True))
     parts, kept = parts.copy(), []
     for number in order:
         own = np.flatnonzero(parts == number)
-        hue = np.median(color[own], axis=0)
-        best = (config.gap_m, -1)
+        hue = np.median(hues[own], axis=0)
+        mask = (parts == number).reshape(height, width).astype(np.uint8)
+        sliver = not cv2.erode(mask, kernel, borderValue=0).any()
+        best = (np.inf, -1)
         for other, tree, other_hue in kept:
-            similar = np.linalg.norm(hue - other_hue) <= config.color_difference
-            if similar and sizes[number] <= config.piece * sizes[other]:
-                gap = float(tree.query(points[own])[0].min())
-                best = min(best, (gap, other))
+            same = np.linalg.norm(hue - other_hue) <= config.color_difference
+            if same or sliver:
+                small = sliver or sizes[number] <= config.piece * sizes[other]
+                gap = float(tree.query(flat[own])[0].min())
+                if gap <= config.gap_m * (1.0 if small else 0.5):
+                    best = min(best, (gap, other))
         if best[1] >= 0:
             parts[own] = best[1]
         else:
-            kept.append((number, KDTree(points[own]), hue))
+            kept.append((number, KDTree(flat[own]), hue))
     return parts

@@ -6,16 +6,18 @@ import numpy as np
 import pytest
 
 from egosim_jax.state.depth import state_from_depth
-from egosim_jax.state.instances import find_objects, object_sizes
+from egosim_jax.state.instances import ObjectSearch, find_objects, object_sizes
+from egosim_jax.types import InputError
 from tests.boxes import GREEN, RED, Box, cameras, cast
 
 VIEW = cameras(1)
 BLUE = (50, 80, 180)
 
 
-def search(boxes, view=VIEW, change=lambda depth: depth):
+def search(boxes, view=VIEW, change=lambda depth: depth, **options):
     image, depth, ids = cast(boxes, view)
-    return find_objects(image, change(depth), view.intrinsics_px), ids
+    thresholds = ObjectSearch(**options)
+    return find_objects(image, change(depth), view.intrinsics_px, thresholds), ids
 
 
 def overlaps(found, ids):
@@ -28,11 +30,11 @@ def overlaps(found, ids):
     return unions, int(found.max())
 
 
-NEXT = replace(RED, corner_m=(-0.01, 0.09, 0), color=BLUE, number=2)
-STACKED = Box((-0.055, 0.085, 0.07), (0.04, 0.04, 0.03), BLUE, 2)
+NEXT = Box((-0.01, 0.09, 0), (0.05, 0.05, 0.04), BLUE, 2)
+STACKED = Box((-0.05, 0.09, 0.07), (0.03, 0.03, 0.03), BLUE, 2)
 CUT = replace(RED, corner_m=(0.05, -0.09, 0), color=BLUE, number=2)
 LARGE = Box((-0.15, 0.05, 0), (0.22, 0.2, 0.1), BLUE, 1)
-THIN = Box((0.05, 0.05, 0), (0.1, 0.01, 0.008), BLUE, 2)
+THIN = Box((0.05, 0.05, 0), (0.1, 0.012, 0.012), BLUE, 2)
 
 
 @pytest.mark.parametrize(
@@ -81,8 +83,10 @@ def test_objects_are_found_in_depth_of_sensors_and_networks(change):
     assert min(unions.values()) > 0.7, unions
 
 
-def test_a_large_image_has_the_same_objects():
-    unions, count = overlaps(*search([RED, GREEN], view=cameras(1, height=576, width=960)))
+def test_a_subsampled_image_has_the_same_objects():
+    unions, count = overlaps(
+        *search([RED, GREEN], view=cameras(1, height=192, width=320), max_width=160)
+    )
     assert count == 2
     assert min(unions.values()) > 0.8, unions
 
@@ -92,3 +96,11 @@ def test_sizes_are_of_the_visible_points():
     state = state_from_depth(image, depth, VIEW.intrinsics_px, np.eye(4), object_ids=ids)
     (size,) = object_sizes(state).values()
     np.testing.assert_allclose(size, [0.06, 0.06, 0.1], atol=0.012)
+
+
+def test_arrays_that_do_not_fit_are_refused():
+    image, depth, _ = cast([], VIEW)
+    with pytest.raises(InputError, match="must have the same size"):
+        find_objects(image[:-1], depth, VIEW.intrinsics_px)
+    with pytest.raises(InputError, match="Convert depth_m to meters"):
+        find_objects(image, 1000 * depth, VIEW.intrinsics_px)
