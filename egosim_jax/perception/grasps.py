@@ -28,6 +28,10 @@ MAX_NOISE = 0.25
 """Maximum noise of the opening, as its median second difference in tolerances of a hold."""
 MAX_ENDS = 24
 """Maximum number of frames at which a hold may begin or end if the opening is no evidence."""
+MAX_DEPTH_M = 0.06
+"""Maximum distance of a grip behind the visible side of the gripped object, in meters."""
+FIT_M = 0.01
+"""Distance by which points may be off on either side of a gripped object, in meters."""
 MIN_ARC_DEG = 25.0
 """Minimum angle of an arc, in degrees; a shorter arc does not determine its axis."""
 MAX_ARC_ERROR = 0.05
@@ -52,12 +56,15 @@ class Grip:
     """True if the hand surely held something."""
     radius_m: float
     """Maximum distance of a gripped point from the line between the fingertips, in meters."""
+    eyes_m: Float[np.ndarray, "f 3"]
+    """Place of the camera in each frame."""
 
     @classmethod
     def of(
         cls,
         joints_m: Float[np.ndarray, "f j 3"],
         kind: Kind,
+        eyes_m: Float[np.ndarray, "f 3"],
         *,
         tolerance_m: float,
         radius_m: float,
@@ -72,7 +79,9 @@ class Grip:
         first = int(seen[0])
         holds, sure = find_holds(tips[first : int(seen[-1]) + 1], tolerance_m)
         holds = [(grasped + first, released + first) for grasped, released in holds]
-        return cls(palm_m=palm, tips_m=tips, holds=holds, sure=sure, radius_m=radius_m)
+        return cls(
+            palm_m=palm, tips_m=tips, holds=holds, sure=sure, radius_m=radius_m, eyes_m=eyes_m
+        )
 
     @property
     def grasps(self) -> list[int]:
@@ -91,7 +100,11 @@ class Grip:
 
     def has(self, points_m: Float[np.ndarray, "n 3"], grasped: int) -> bool:
         """Return True if the hand surely holds an object that has these points at a grasp."""
-        return self.sure and is_between(points_m, self.tips_m[grasped], self.radius_m)
+        tips, eye = self.tips_m[grasped], self.eyes_m[grasped]
+        return self.sure and (
+            is_between(points_m, tips, self.radius_m)
+            or is_behind(points_m, tips, eye, self.radius_m)
+        )
 
 
 def seen_frames(joints_m: Float[np.ndarray, "f j 3"]) -> Int[np.ndarray, " k"]:
@@ -148,6 +161,35 @@ def is_between(
     share = (points_m - thumb) @ across / max(across @ across, 1e-12)
     away = np.linalg.norm(points_m - thumb - share[:, None] * across, axis=1)
     return bool(((share > 0) & (share < 1) & (away <= radius_m)).any())
+
+
+def is_behind(
+    points_m: Float[np.ndarray, "n 3"],
+    tips_m: Float[np.ndarray, "j 3"],
+    eye_m: Float[np.ndarray, " 3"],
+    radius_m: float,
+) -> bool:
+    """Return True if the line from the thumb to the fingers is inside an object behind its points.
+
+    Only the side of an object that the camera sees has points. It must fill most of the space
+    between the fingertips. It may be wider than that, as the base of a cone is, but not by much.
+    """
+    thumb, fingers = tips_m[0], tips_m[1:].mean(axis=0)
+    opening = max(float(np.linalg.norm(fingers - thumb)), 1e-9)
+    across = (fingers - thumb) / opening
+    ray = eye_m - (thumb + fingers) / 2
+    ray -= (ray @ across) * across
+    ray /= max(float(np.linalg.norm(ray)), 1e-9)
+    along = (points_m - thumb) @ across
+    away = points_m - thumb - along[:, None] * across
+    toward = away @ ray
+    aside = np.linalg.norm(away - toward[:, None] * ray, axis=1)
+    front = along[(aside <= radius_m) & (toward >= 0) & (toward <= MAX_DEPTH_M)]
+    if not len(front):
+        return False
+    slack = opening / 2 + FIT_M
+    fits = front.min() >= -slack and front.max() <= opening + slack
+    return bool(fits and np.ptp(np.clip(front, 0, opening)) >= opening / 2)
 
 
 def is_firm(

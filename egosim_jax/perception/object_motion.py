@@ -177,7 +177,11 @@ def _best_candidate(
     If the hand holds no object that has an id, it may move one that has none.
     """
     grip = Grip.of(
-        joints_m, action.kind, tolerance_m=config.opening_tolerance_m, radius_m=config.grip_radius_m
+        joints_m,
+        action.kind,
+        action.cameras.world_from_camera[:, :3, 3],
+        tolerance_m=config.opening_tolerance_m,
+        radius_m=config.grip_radius_m,
     )
     found: list[Candidate] = []
     held = False

@@ -1,14 +1,15 @@
-"""Where the points of a state end after a film is perceived and fused, and where they belong."""
+"""Comparison of the points of a state, after a film is perceived and fused, with their places."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from egosim_jax.geometry import transform
 from egosim_jax.perception import Perception
 from egosim_jax.state.depth import state_from_depth
-from egosim_jax.state.fuse import fuse
+from egosim_jax.state.fuse import REPLACE_M, fuse
 from egosim_jax.types import SceneState
 from tests.mujoco_world.world import Film
 
@@ -24,11 +25,11 @@ class Verdict:
     """Shares of the points of the first image, by the objects that they truly belong to."""
 
     moved: float
-    """Of the moved object's points, in place at the end."""
+    """Share of the moved object's points that are in place at the end."""
     left: float
-    """Of the moved object's points, still where they were."""
+    """Share of the moved object's points that are still where they were."""
     still: float
-    """Of the other objects' points, in place at the end."""
+    """Share of the other objects' points that are in place at the end."""
     dragged: float
     """Points of the scenery that moved, in points of the moved object."""
     error_m: float
@@ -67,9 +68,9 @@ def state_of(film: Film, ids: Ids) -> SceneState:
 
 
 def judge(film: Film, perception: Perception, ids: Ids) -> Verdict:
-    """Perceive the film as if it were generated, and compare the fused state with the truth."""
-    state, truth = state_of(film, ids), state_of(film, "true")
-    starts, owners = truth.points_m, truth.object_ids
+    """Perceive the film as if it were generated, and compare the fused state with the simulation."""
+    state, known = state_of(film, ids), state_of(film, "true")
+    starts, owners = known.points_m, known.object_ids
     places = starts.astype(float)
     for number, path in film.motions.items():
         own = owners == number
@@ -81,23 +82,24 @@ def judge(film: Film, perception: Perception, ids: Ids) -> Verdict:
     white = np.full_like(perceived.frames, 255)
     fused = fuse(replace(state, colors=tags), replace(perceived, frames=white))
     tag = fused.colors.astype(int) @ [1 << 16, 1 << 8, 1]
-    known = np.flatnonzero(tag < len(starts))  # the rest are new points
-    source = tag[known]
+    old = np.flatnonzero(tag < len(starts))  # the rest are new points
+    source = tag[old]
     error, behind = (
-        _nearest(np.linalg.norm(fused.points_m[known] - wanted[source], axis=1), source, len(index))
+        _nearest(np.linalg.norm(fused.points_m[old] - wanted[source], axis=1), source, len(index))
         for wanted in (places, starts)
     )
+    error = _inherit(error, starts, owners)
     target, scenery = owners == film.target_id, owners == 0
     others = ~target & ~scenery
     gone = np.linalg.norm(places - starts, axis=1) > MOVED_M
     shown = np.full(fused.colors.shape, (255, 0, 255), np.uint8)
-    shown[known] = state.colors[source]
+    shown[old] = state.colors[source]
     colors = np.full(fused.colors.shape, 170, np.uint8)
     wrong = error[source] > NEAR_M
-    colors[known[scenery[source]]] = 110
-    colors[known[scenery[source] & wrong]] = 240, 220, 40
-    colors[known[target[source]]] = 40, 190, 60
-    colors[known[~scenery[source] & wrong]] = 230, 40, 40
+    colors[old[scenery[source]]] = 110
+    colors[old[scenery[source] & wrong]] = 240, 220, 40
+    colors[old[target[source]]] = 40, 190, 60
+    colors[old[~scenery[source] & wrong]] = 230, 40, 40
     return Verdict(
         moved=float((error[target] <= NEAR_M).mean()),
         left=float(((behind <= NEAR_M) & gone)[target].mean()),
@@ -112,7 +114,22 @@ def judge(film: Film, perception: Perception, ids: Ids) -> Verdict:
 
 
 def _nearest(distances: np.ndarray, source: np.ndarray, count: int) -> np.ndarray:
-    """Return the least distance by source; infinite where there is none."""
+    """Return the least distance by source; infinite for a source without any."""
     nearest = np.full(count, np.inf)
     np.minimum.at(nearest, source, distances)
     return nearest
+
+
+def _inherit(error: np.ndarray, starts: np.ndarray, owners: np.ndarray) -> np.ndarray:
+    """Give a point that a new one replaced the error of its nearest neighbor that is left.
+
+    A new point replaces all within `REPLACE_M`, and carries the color of one of them.
+    """
+    found = error.copy()
+    for number in np.unique(owners):
+        (lost,) = np.nonzero((owners == number) & np.isinf(error))
+        (kept,) = np.nonzero((owners == number) & np.isfinite(error))
+        if len(lost) and len(kept):
+            gaps, nearest = KDTree(starts[kept]).query(starts[lost])
+            found[lost] = np.where(gaps <= REPLACE_M, error[kept[nearest]], np.inf)
+    return found

@@ -103,7 +103,7 @@ def tube(path_m: np.ndarray, radius_m: float) -> Mesh:
 
 
 def _strips(rings: int, sides: int) -> np.ndarray:
-    """Return the triangles between successive rings, the last of which joins the first."""
+    """Return the triangles between successive rings; the last ring joins the first."""
     faces = []
     for i in range(rings):
         for k in range(sides):
@@ -149,7 +149,7 @@ def ball(x: float, y: float, z: float) -> Solid:
 
 
 def rod(radius: float, length: float) -> Solid:
-    """Return a capsule that lies along y."""
+    """Return a capsule along y, on its side."""
     turn = (np.sqrt(0.5), np.sqrt(0.5), 0, 0)
     half = length / 2 - radius
     part = Part(shape="capsule", size_m=(radius, half), center_m=(0, 0, radius), turn=turn)

@@ -16,12 +16,12 @@ PATTERNS = ("plain", "checks", "stripes", "spots")
 GAP_M = 0.02
 """Least distance between solids that do not touch, in meters."""
 TABLE_M = ((-0.19, 0.19), (-0.07, 0.2))
-"""Ranges of x and y on the table in which solids stand, in view of the camera."""
+"""Ranges of x and y on the table of the solids, in view of the camera."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """What the gripper does to one solid, and what is next to it."""
+    """A deed of the gripper with one solid, and the solids next to it."""
 
     solid: str
     deed: Deed = "carry"
@@ -29,7 +29,7 @@ class Task:
     behind: str = ""
     """Solid that touches it on the far side."""
     below: str = ""
-    """Solid on which it stands."""
+    """Solid below it."""
     onto: str = ""
     """Solid on which it is put down."""
     frames: int = 17
@@ -78,7 +78,7 @@ class Placed:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """The solids of a scene, the first of which the gripper moves, and the goal of that one."""
+    """The solids of a scene; the gripper moves the first to the goal."""
 
     task: Task
     placed: tuple[Placed, ...]
@@ -86,7 +86,7 @@ class Layout:
     goal_yaw: float
 
 
-def lay_out(seed: int) -> Layout:
+def make_layout(seed: int) -> Layout:
     """Return the scene of a seed: its task is the seed modulo 24, the rest is drawn."""
     task, rng = TASKS[seed % len(TASKS)], np.random.default_rng(seed)
     while (layout := _draw(task, rng)) is None:
@@ -123,7 +123,7 @@ def _draw(task: Task, rng: np.random.Generator) -> Layout | None:
     if task.onto:
         put(task.onto, goal * [1, 1, 0], yaw)
     taken.append((goal[:2], max(target.reach_m, placed[-1].solid.reach_m if task.onto else 0)))
-    if task.deed == "push":  # nothing stands in the way
+    if task.deed == "push":  # a free way
         taken += [(start[:2] + t * (goal - start)[:2], target.reach_m) for t in (0.33, 0.67)]
     for name in rng.permutation(sorted(set(SOLIDS) - {"crate", "pen", "card", task.solid})):
         reach = SOLIDS[name]().reach_m

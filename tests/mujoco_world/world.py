@@ -13,7 +13,7 @@ import numpy as np
 from egosim_jax.geometry import invert, look_at, pixel_rays
 from egosim_jax.types import Action, Cameras, Clip
 from tests.mujoco_world.solids import SHAPES, Part, Texture
-from tests.mujoco_world.tasks import Layout, lay_out
+from tests.mujoco_world.tasks import Layout, make_layout
 
 FPS, STEPS = 8, 50
 """Frames per second, and steps of physics per frame."""
@@ -54,7 +54,7 @@ class Film:
 
 def make_film(seed: int) -> Film:
     """Simulate the task of a seed and render it."""
-    layout = lay_out(seed)
+    layout = make_layout(seed)
     model, textures = _build(layout)
     data = mujoco.MjData(model)
     cameras = _cameras(layout.task.frames, np.random.default_rng([seed, 1]))

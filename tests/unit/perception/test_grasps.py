@@ -9,6 +9,7 @@ from egosim_jax.perception.grasps import (
     couplings,
     find_holds,
     hinge_motion,
+    is_behind,
     is_between,
     is_firm,
     palm_motion,
@@ -63,6 +64,39 @@ def test_the_grip_is_a_cylinder_between_thumb_and_fingers(point_cm, between):
     (tips,) = fingers([6])
     away = np.array([[0.2, 0.2, 0.2], np.array(point_cm) / 100])
     assert is_between(away, tips, radius_m=0.01) is between
+
+
+@pytest.mark.parametrize(
+    ("width_cm", "in_front_cm", "gripped"),
+    [
+        (6, 3, True),
+        (4, 5, True),
+        (2, 3, False),
+        (10, 3, True),
+        (16, 3, False),
+        (6, 8, False),
+        (6, -2, False),
+    ],
+    ids=[
+        "its front",
+        "smaller",
+        "too small",
+        "wider",
+        "too wide",
+        "too far in front",
+        "behind the grip",
+    ],
+)
+def test_a_grip_is_inside_an_object_behind_its_front(width_cm, in_front_cm, gripped):
+    """A camera above sees the top of a box, which the fingers take further down."""
+    (tips,) = fingers([6])
+    across = (tips[1:].mean(axis=0) - tips[0]) / 0.06
+    up = np.cross(across, [1.0, 0.3, 0.2])
+    up /= np.linalg.norm(up)
+    along = np.linspace(-width_cm / 200, width_cm / 200, 9)
+    middle = (tips[0] + tips[1:].mean(axis=0)) / 2
+    top = middle + along[:, None] * across + in_front_cm / 100 * up
+    assert is_behind(top, tips, middle + 0.5 * up, radius_m=0.012) is gripped
 
 
 def test_a_hinge_turns_a_held_object_about_its_axis():

@@ -54,7 +54,9 @@ def scene(*things):
 def closed_on(thumb, fingers):
     """Return a grip from the first to the last of three frames, with the fingertips at places."""
     tips = np.repeat(np.array([[thumb, fingers]], float), 3, axis=0)
-    return Grip(palm_m=tips, tips_m=tips, holds=[(0, 2)], sure=True, radius_m=0.012)
+    return Grip(
+        palm_m=tips, tips_m=tips, holds=[(0, 2)], sure=True, radius_m=0.012, eyes_m=np.zeros((3, 3))
+    )
 
 
 def grown(state, grip, config=None):

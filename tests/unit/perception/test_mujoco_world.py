@@ -18,7 +18,7 @@ def film() -> Film:
 
 
 def perceive(film: Film, motions: dict[int, np.ndarray]) -> Perceived:
-    """Return what is perceived if these motions are all that a perception finds."""
+    """Return a reconstruction with these motions and no depth."""
     frames = film.clip.frames
     return Perceived(
         step=1,
