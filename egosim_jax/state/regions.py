@@ -279,7 +279,7 @@ def _join_pieces(
 ) -> Int[np.ndarray, " n"]:
     """Join each separate part with the closest larger part of the same hue.
 
-    A sliver, such as the side of a box that is seen at a grazing angle, has no color of its own.
+    A sliver, such as the side of a box that is seen at a grazing angle, has no reliable color.
     """
     import cv2
     from scipy.spatial import KDTree
