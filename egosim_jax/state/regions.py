@@ -36,9 +36,11 @@ class RegionConfig:
     color_difference: float = 8.0
     """Minimum difference between the colors of two objects, in units of CIELAB."""
     gap_m: float = 0.012
-    """Maximum distance of a small piece from its object, in meters; half of it for a large one."""
+    """Maximum distance of a small piece from its object, in meters; 3/4 of it for a large one."""
     piece: float = 0.25
     """Maximum size of a small piece, as a fraction of its object's."""
+    sliver_m: float = 0.06
+    """Maximum distance of a sliver from the object next to it in the image, in meters."""
 
 
 class _Sets:
@@ -277,7 +279,7 @@ def _join_pieces(
 ) -> Int[np.ndarray, " n"]:
     """Join each separate part with the closest larger part of the same hue.
 
-    A sliver, such as the side of a box that is seen at a grazing angle, has no color of its own.
+    A sliver, such as the side of a box that is seen at a grazing angle, has no reliable color.
     """
     import cv2
     from scipy.spatial import KDTree
@@ -294,14 +296,18 @@ def _join_pieces(
         hue = np.median(hues[own], axis=0)
         mask = (parts == number).reshape(height, width).astype(np.uint8)
         sliver = not cv2.erode(mask, kernel, borderValue=0).any()
+        nearby = set(np.unique(parts[cv2.dilate(mask, kernel, iterations=2).ravel() > 0]).tolist())
         best = (np.inf, -1)
         for other, tree, other_hue in kept:
-            same = np.linalg.norm(hue - other_hue) <= config.color_difference
-            if same or sliver:
-                small = sliver or sizes[number] <= config.piece * sizes[other]
-                gap = float(tree.query(flat[own])[0].min())
-                if gap <= config.gap_m * (1.0 if small else 0.5):
-                    best = min(best, (gap, other))
+            small = sizes[number] <= config.piece * sizes[other]
+            limit = config.gap_m * (1.0 if small else 0.75)
+            if sliver and other in nearby:
+                limit = config.sliver_m
+            elif np.linalg.norm(hue - other_hue) > config.color_difference:
+                continue
+            gap = float(tree.query(flat[own])[0].min())
+            if gap <= limit:
+                best = min(best, (gap, other))
         if best[1] >= 0:
             parts[own] = best[1]
         else:
