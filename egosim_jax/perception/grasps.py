@@ -36,10 +36,8 @@ MIN_ARC_DEG = 25.0
 """Minimum angle of an arc, in degrees; a shorter arc does not determine its axis."""
 MAX_ARC_ERROR = 0.05
 """Maximum distance of the fingertips from an arc, as a fraction of its radius."""
-FIRM_RADIUS_M = 0.025
-"""Distance from the line through the fingertips within which an object fills a grip, in meters."""
-FIRM_SLACK_M = (0.008, 0.035)
-"""Maximum depth of a fingertip in the object that it holds, and maximum free space between them."""
+FIRM_TOUCH_M = 0.015
+"""Maximum distance of fingertips inside or outside the surface of an object that they hold."""
 FIRM_TRAVEL_M = 0.03
 """Minimum distance that a hand carries what it holds firmly, in meters."""
 
@@ -193,26 +191,21 @@ def is_behind(
 
 
 def is_firm(
-    points_m: Float[np.ndarray, "n 3"], tips_m: Float[np.ndarray, "f j 3"], hold: tuple[int, int]
+    faces: Float[np.ndarray, "m 4"], tips_m: Float[np.ndarray, "f j 3"], hold: tuple[int, int]
 ) -> bool:
     """Return True if the fingertips close on two sides of an object, and then carry it away.
 
-    The object must fit between them and fill the space, at the grasp. Only the visible side of an
-    object has points, so it may be somewhat narrower than the grip.
+    `faces` are the outward planes of the object's convex hull at the grasp. Both thumb and fingers
+    must touch the hull, with the middle between them inside it.
     """
     grasped, released = hold
     thumb, fingers = tips_m[:, 0], tips_m[:, 1:].mean(axis=1)
-    middle = (thumb + fingers)[grasped : released + 1] / 2
-    if np.linalg.norm(middle - middle[0], axis=1).max() < FIRM_TRAVEL_M:
-        return False
-    opening = float(np.linalg.norm(fingers[grasped] - thumb[grasped]))
-    across = (fingers[grasped] - thumb[grasped]) / max(opening, 1e-9)
-    along = (points_m - thumb[grasped]) @ across
-    away = np.linalg.norm(points_m - thumb[grasped] - along[:, None] * across, axis=1)
-    held = along[away <= FIRM_RADIUS_M]
-    inside, slack = FIRM_SLACK_M
-    fits = len(held) > 0 and held.min() >= -inside and held.max() <= opening + inside
-    return bool(fits and opening - np.ptp(held) <= slack)
+    middle = (thumb + fingers) / 2
+    carried = middle[grasped : released + 1] - middle[grasped]
+    places = np.stack([thumb[grasped], fingers[grasped], middle[grasped]])
+    outside = (places @ faces[:, :3].T + faces[:, 3]).max(axis=1)
+    touched = np.abs(outside[:2]).max() <= FIRM_TOUCH_M and outside[2] < 0
+    return bool(touched and np.linalg.norm(carried, axis=1).max() >= FIRM_TRAVEL_M)
 
 
 def palm_motion(palm_m: Float[np.ndarray, "f j 3"], grasped: int) -> Float[np.ndarray, "f 4 4"]:

@@ -3,7 +3,7 @@
 A pixel that no point of the state explains may continue a plane of the background: the table beside
 its observed part, the table under an object that moved away, or the floor. It does if its ray meets
 the plane near observed points of the plane, and its color is one of theirs. A table ends at its
-edge, and the picture shows where: beyond it the colors are other ones. Everything else stays
+edge, and the frames show where: beyond it the colors are other ones. Everything else stays
 unknown.
 """
 
@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 
 from egosim_jax.geometry import invert, pixel_rays, transform
+from egosim_jax.perception.hulls import hull_on_plane
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.perception.pose_refinement import ColorCost
 from egosim_jax.rendering.reference import add_margin, close_gaps, splat
@@ -24,15 +25,12 @@ from egosim_jax.state.fuse import dilate
 from egosim_jax.state.planes import fit_plane
 from egosim_jax.types import Action, Cameras, Clip, SceneState, check_counts
 
-HULL_POINTS = 400
-"""Approximate number of an object's points in its hull."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class NewSurfaces:
     """Stage that sets the depth of pixels that continue a plane of the state."""
 
-    max_frames: int = 17
+    max_frames: int = 9
     """Maximum number of frames that are searched, evenly spaced."""
     max_planes: int = 4
     """Maximum number of planes of the background."""
@@ -104,8 +102,8 @@ class NewSurfaces:
         for plane in planes:
             pixels.offer(plane, apart)
         for number, motion in motions.items():
-            hull = _hull(number, motion, supports[number], state, self.compared_points)
-            if hull is not None:
+            hull = _hull(number, motion, supports[number], state)
+            if hull is not None and len(hull.points_m) >= self.compared_points:
                 pixels.offer(hull, dilate(ids == number, self.side_margin))
         background = (index >= 0) & (state.object_ids[rest][index] == 0) & (ids == 0)
         depth[new], ids[new] = pixels.depth_m, pixels.object_ids
@@ -115,7 +113,7 @@ class NewSurfaces:
             with np.errstate(invalid="ignore"):
                 continued = new & (np.abs(there - depth) <= self.tolerance_m)
                 flush = background & (np.abs(there - known_m) <= self.tolerance_m)
-            seam = dilate(continued, 0) & flush
+            seam = dilate(continued, 0.0) & flush
             depth[seam] = there[seam]
         return depth, ids
 
@@ -131,13 +129,13 @@ class NewSurfaces:
         some = some[:: max(1, len(some) // self.plane_points)]
         for plane in supports:
             gaps = np.abs(state.points_m[some] @ plane[:3] + plane[3])
-            planes.append(_Plane.of(plane, state, some[gaps <= self.tolerance_m]))
+            planes.append(_Plane(plane=plane, **_points_of(state, some[gaps <= self.tolerance_m])))
         some = some[state.object_ids[some] == 0]
         while len(some) >= self.min_points and len(planes) < len(supports) + self.max_planes:
             plane, inliers = fit_plane(state.points_m[some], self.tolerance_m)
             if len(inliers) < self.min_points:
                 break
-            planes.append(_Plane.of(plane, state, some[inliers]))
+            planes.append(_Plane(plane=plane, **_points_of(state, some[inliers])))
             some = np.delete(some, inliers)
         return [plane for plane in planes if len(plane.points_m) >= self.compared_points]
 
@@ -155,15 +153,6 @@ class _Surface:
 class _Plane(_Surface):
     plane: Float[np.ndarray, " 4"]
     """Plane a x + b y + c z + d = 0."""
-
-    @classmethod
-    def of(cls, plane: Float[np.ndarray, " 4"], state: SceneState, chosen: np.ndarray) -> _Plane:
-        return cls(
-            plane=plane,
-            points_m=state.points_m[chosen].astype(float),
-            colors=state.colors[chosen].astype(np.float32),
-            object_ids=state.object_ids[chosen],
-        )
 
     def meet(
         self,
@@ -204,33 +193,26 @@ class _Hull(_Surface):
         return depth, eye + np.where(np.isfinite(depth), depth, 0)[:, None] * toward
 
 
+def _points_of(state: SceneState, chosen: Int[np.ndarray, " n"]) -> dict[str, np.ndarray]:
+    return {
+        "points_m": state.points_m[chosen].astype(float),
+        "colors": state.colors[chosen].astype(np.float32),
+        "object_ids": state.object_ids[chosen],
+    }
+
+
 def _hull(
     number: int,
     motion: Float[np.ndarray, "f 4 4"],
     plane: Float[np.ndarray, " 4"],
     state: SceneState,
-    min_points: int,
 ) -> _Hull | None:
-    """Return the convex hull of an object's points and of their feet on the supporting plane."""
-    from scipy.spatial import ConvexHull, QhullError
-
+    """Return the hull of a moved object; None if its points do not span a volume."""
     own = np.flatnonzero(state.object_ids == number)
-    if len(own) < min_points:
+    faces = hull_on_plane(state.points_m[own].astype(float), plane)
+    if faces is None:
         return None
-    own = own[:: max(1, len(own) // HULL_POINTS)]
-    points = state.points_m[own].astype(float)
-    feet = points - (points @ plane[:3] + plane[3])[:, None] * plane[:3]
-    try:
-        hull = ConvexHull(np.concatenate([points, feet]) if np.isfinite(feet).all() else points)
-    except (QhullError, ValueError):
-        return None  # all in one plane
-    return _Hull(
-        points_m=points,
-        colors=state.colors[own].astype(np.float32),
-        object_ids=state.object_ids[own],
-        faces=hull.equations,
-        motion=motion,
-    )
+    return _Hull(faces=faces, motion=motion, **_points_of(state, own))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,6 +21,7 @@ from egosim_jax.geometry import UP_AXES, Up, invert, pixels_of, transform, up_of
 from egosim_jax.perception.extent import Candidate, choose_extent, moving_part
 from egosim_jax.perception.grasps import MIN_HELD, Grip, couplings, is_firm, seen_frames
 from egosim_jax.perception.growth import NEW, Growth, clusters_without_id
+from egosim_jax.perception.hulls import hull_on_plane
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.perception.pose_refinement import (
     ColorCost,
@@ -65,7 +66,7 @@ class TrackObjects:
     """Maximum distance of a gripped object from the line between the fingertips, in meters."""
     grip_evidence: float = 8.0
     """Maximum cost of a gripped object's motion above the cost at rest, in 8-bit levels."""
-    firm_evidence: float = 60.0
+    firm_evidence: float = 90.0
     """The same for an object that a hand holds firmly and carries away.
 
     A generated clip may leave an object where the state has it, as if no hand had taken it."""
@@ -233,10 +234,11 @@ def _best_motion(
     still = np.repeat(np.eye(4)[None], len(shown), axis=0)
     rest = _cost(model, still, cameras, shown, hidden, config)
     improvement = max(config.min_improvement, (1 - config.max_cost_ratio) * rest)
+    faces = hull_on_plane(model.points_m, model.plane)
     for hold in grip.holds:
         gripped = grip.has(model.points_m, hold[0])
         max_change = config.grip_evidence if gripped else -improvement
-        if gripped and is_firm(model.points_m, grip.tips_m, hold):
+        if gripped and faces is not None and is_firm(faces, grip.tips_m, hold):
             max_change = config.firm_evidence
         loose = couplings(grip.palm_m, grip.rigid[hold[0]], model.plane[:3], hold)
         hinge = grip.hinges[hold]

@@ -140,12 +140,14 @@ def refine_pose(
     far, turned = config.deviation_m or np.inf, np.radians(config.deviation_deg or np.inf)
     scale = np.array([far, far, far, turned])
     change, best_cost = np.zeros(4), scene.cost(best.path[frames], color)
+    # An object that was put down stays on the surface: its height is known.
+    axes = np.linalg.svd(best.model.plane[None, :3])[2][1:] if best.lands else np.eye(3)
     for meters, degrees in zip(config.steps_m, config.steps_deg, strict=True):
-        steps = np.diag([meters, meters, meters, np.radians(degrees)])
+        steps = [*np.pad(meters * axes, [(0, 0), (0, 1)]), np.array([0, 0, 0, np.radians(degrees)])]
         improved = True
         while improved:
             improved = False
-            for step in (*steps, *-steps):
+            for step in (*steps, *(-step for step in steps)):
                 cost = scene.cost(perturb(best, change + step)[frames], color)
                 cost += float(np.square((change + step) / scale).sum())
                 if cost < best_cost:

@@ -156,24 +156,25 @@ def turn(axis, point, angle):
     ("low_cm", "high_cm", "travel_cm", "firm"),
     [
         ([0.2, -1, -1], [4.8, 1, 1], 10, True),
-        ([1, -1, -1], [4.5, 1, 1], 10, True),
+        ([-0.8, -1, -1], [5.8, 1, 1], 10, True),
         ([0.2, -1, -1], [4.8, 1, 1], 1, False),
-        ([2, -1, -1], [8, 1, 1], 10, False),
-        ([0.2, 3, -1], [4.8, 5, 1], 10, False),
+        ([2, -2, -2], [8, 2, 2], 10, False),
+        ([0.2, 0.4, -1], [4.8, 4, 1], 10, False),
         ([2, -0.2, -0.2], [2.5, 0.2, 0.2], 10, False),
     ],
     ids=[
         "both sides touched",
-        "the far side is not observed",
+        "soft fingertips",
         "not carried away",
         "a finger would be inside",
         "closed beside it",
-        "much free space",
+        "not closed on it",
     ],
 )
-def test_a_grip_is_firm_if_the_object_fills_it_and_leaves(low_cm, high_cm, travel_cm, firm):
-    corners = np.stack(np.meshgrid(*np.linspace(low_cm, high_cm, 5).T), axis=-1)
+def test_a_grip_is_firm_if_both_sides_are_touched_and_it_leaves(low_cm, high_cm, travel_cm, firm):
+    low, high = np.array(low_cm) / 100, np.array(high_cm) / 100
+    faces = np.concatenate([np.c_[np.eye(3), -high], np.c_[-np.eye(3), low]])
     tips = np.zeros((6, 3, 3))
-    tips[:, 1:, 0] = 5
-    tips[:, :, 2] = np.linspace(0, travel_cm, 6)[:, None]
-    assert is_firm(corners.reshape(-1, 3) / 100, tips / 100, (0, 5)) == firm
+    tips[:, 1:, 0] = 0.05
+    tips[:, :, 2] = np.linspace(0, travel_cm / 100, 6)[:, None]
+    assert is_firm(faces, tips, (0, 5)) == firm
