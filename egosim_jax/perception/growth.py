@@ -23,6 +23,8 @@ from egosim_jax.types import Cameras, SceneState
 
 NEW = 0
 """Number of an object that has no id yet."""
+SEAM_COLORS = 8
+"""Number of nearest points whose colors a point at a border between objects is compared with."""
 NEIGHBORS = 16
 """Number of nearest points that determine a point's normal."""
 HOLLOW = 0.15
@@ -222,7 +224,7 @@ class Surroundings:
         ):
             if core.sum() < self.config.min_points:
                 continue
-            members = self.with_crumbs(core)
+            members = self.with_crumbs(self.with_seam(core, whole))
             if any((members & old).sum() > 0.95 * (members | old).sum() for old in found):
                 continue
             found.append(members)
@@ -253,6 +255,30 @@ class Surroundings:
         piece = (close > 0) & ((count < self.config.min_points) | (close >= 0.9 * count))
         grown = members.copy()
         grown[rest] = piece[parts[rest]]
+        return grown
+
+    def with_seam(
+        self, members: Bool[np.ndarray, " n"], whole: Bool[np.ndarray, " n"]
+    ) -> Bool[np.ndarray, " n"]:
+        """Return an object's points with those at its border that look more like it than the rest.
+
+        At a concave edge to another object, the shape does not say which points are on which side.
+        """
+        from scipy.spatial import KDTree
+
+        (outside,) = np.nonzero(whole & ~members)
+        gaps = KDTree(self.points_m[members]).query(self.points_m[outside])[0]
+        seam, rest = outside[gaps <= 1.5 * self.radius_m], outside[gaps > 1.5 * self.radius_m]
+        if not len(seam) or len(rest) < SEAM_COLORS:
+            return members
+
+        def difference(others: Int[np.ndarray, " m"]) -> Float[np.ndarray, " s"]:
+            nearest = KDTree(self.points_m[others]).query(self.points_m[seam], SEAM_COLORS)[1]
+            colors = self.colors[others][nearest] - self.colors[seam][:, None]
+            return np.linalg.norm(colors, axis=2).min(axis=1)
+
+        grown = members.copy()
+        grown[seam] = difference(np.flatnonzero(members)) < difference(rest)
         return grown
 
     def model(self, members: Bool[np.ndarray, " n"]) -> ObjectModel:
