@@ -22,9 +22,9 @@ from egosim_jax.types import Cameras, SceneState
 FRAMES = 5
 """Number of compared frames, from the grasp to the end."""
 SMALLER = 0.1
-"""Exponent of a part's relative size in the factor by which it must explain the clip better."""
+"""Exponent of a part's relative size in the factor on its cost."""
 WITHOUT_EDGES = 1.2
-"""Factor by which a part without edges must explain the clip better."""
+"""Factor on the cost of a part without edges."""
 NOISE = 3.0
 """Difference from the clip that means nothing, in 8-bit levels."""
 MIN_KNOWN = 0.25
@@ -54,11 +54,11 @@ def choose_extent(
     hidden: Bool[np.ndarray, "f h w"],
     color: ColorCost,
 ) -> int:
-    """Return the index of the candidate whose part of a thing explains the clip best.
+    """Return the index of the candidate whose part of a cluster explains the clip best.
 
-    The thing has some growths, the whole first; a moving part that is none of them has no edges. A
-    smaller growth must explain the clip better, and a part without edges better still: gray frames
-    explain nothing. If too little can be compared, the points of each candidate alone decide.
+    The cluster has some growths, the whole first; a moving part has no edges. A smaller growth must
+    explain the clip better, and a part without edges better still: gray frames explain nothing. If
+    too little can be compared, the points of each candidate alone decide.
     """
     if len(candidates) == 1:
         return 0
@@ -80,9 +80,9 @@ def moving_part(
     hidden: Bool[np.ndarray, "f h w"],
     color: ColorCost,
 ) -> ObjectModel:
-    """Return a thing without the points that the clip shows at rest.
+    """Return a cluster without the points that the clip shows at rest.
 
-    A lid has no edge where it lies flush on its box. Points that could be both move along.
+    A lid has no edge where it is flush with its box. Points that could be both move along.
     """
     from scipy.spatial import KDTree
 
@@ -140,8 +140,8 @@ def predicted_costs(
 ) -> Float[np.ndarray, " m"] | None:
     """Return how far the scene that each motion predicts is from the clip, in 8-bit levels.
 
-    Behind the `whole` connected thing is its support. Nobody knows what is behind a part of it, so
-    such pixels are not compared. Without them too few may be left; then the result is None.
+    The support is behind the `whole` cluster. Behind a part of it nothing is known, so these pixels
+    are not compared. If too few are left, the result is None.
     """
     import cv2
 

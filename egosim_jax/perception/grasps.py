@@ -85,7 +85,7 @@ class Grip:
 
     @cached_property
     def hinges(self) -> dict[tuple[int, int], Float[np.ndarray, "f 4 4"] | None]:
-        """Motion about a hinge in each hold; None where there is none."""
+        """Motion about a hinge in each hold; None without a hinge."""
         return {hold: hinge_motion(self.tips_m, hold) for hold in self.holds}
 
     def has(self, points_m: Float[np.ndarray, "n 3"], grasped: int) -> bool:

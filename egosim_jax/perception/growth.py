@@ -176,11 +176,11 @@ class Surroundings:
     def touched(
         self, grips: Sequence[Float[np.ndarray, "j 3"]]
     ) -> tuple[list[list[ObjectModel]], str]:
-        """Return the growths of each thing that one of the grips touches, and a note.
+        """Return the growths of each cluster that one of the grips touches, and a note.
 
         A grip is the places of the fingertips. The note says why there is no growth.
         """
-        things: dict[int, list[ObjectModel]] = {}
+        clusters: dict[int, list[ObjectModel]] = {}
         notes = ["closed on nothing"]
         everything = np.ones(len(self.points_m), bool)
         parts = self.parts(everything) if len(everything) > 1 else np.zeros(len(everything), int)
@@ -188,21 +188,21 @@ class Surroundings:
             seeds = seeds_between(self.points_m, tips, self.config.reach_m)
             if not len(seeds):
                 if len(seeds_between(self.low_m, tips, self.config.reach_m / 2)):
-                    notes.append("closed on something that cannot be told from its support")
+                    notes.append("closed on something that looks like its support")
                 continue
             part = int(np.bincount(parts[seeds]).argmax())
-            if part in things:
+            if part in clusters:
                 continue
             if (parts == part).sum() < self.config.min_points:
                 notes.append("closed on too few points to be an object")
                 continue
             growths = list(self.grow(seeds[parts[seeds] == part], parts == part))
             small = [g for g in growths if self.extent_m(g) <= self.config.max_extent_m]
-            things[part] = [self.model(members) for members in small]
+            clusters[part] = [self.model(members) for members in small]
             if not small:
                 limit = self.config.max_extent_m
                 notes.append(f"closed on something larger than {limit} m: it was not moved")
-        found = [growths for growths in things.values() if growths]
+        found = [growths for growths in clusters.values() if growths]
         return found, "" if found else notes[-1]
 
     def grow(
@@ -235,7 +235,7 @@ class Surroundings:
         return float(np.ptp(self.points_m[members], axis=0).max())
 
     def with_crumbs(self, members: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-        """Return an object's points with the pieces beside it that are too small for an object.
+        """Return an object's points with the pieces next to it that are too small for an object.
 
         Such pieces are a seam along its edge, whose points mix two colors or, where the surface
         turns away from the camera, are far behind each other.
@@ -336,12 +336,12 @@ class Surroundings:
         return np.linalg.norm(self.colors - light[:, None] * own, axis=1)
 
 
-def things_without_id(
+def clusters_without_id(
     grip: Grip, cameras: Cameras, state: SceneState, config: Growth
 ) -> tuple[list[list[ObjectModel]], str]:
-    """Return the growths of each thing without an id that a hand touches, and a note.
+    """Return the growths of each cluster without an id that a hand touches, and a note.
 
-    The growths of a thing begin with the largest. The note says why a hand that surely held
+    The growths of a cluster begin with the largest. The note says why a hand that surely held
     something has no growth.
     """
     pinches = grip.tips_m[grip.grasps].mean(axis=1)
@@ -351,8 +351,8 @@ def things_without_id(
     if len(free) < config.min_points:
         return [], "closed on nothing" if grip.sure else ""
     around = Surroundings.of(state, free, cameras.world_from_camera[0, :3, 3], config)
-    things, note = around.touched([grip.tips_m[frame] for frame in grip.grasps])
-    return things, note if grip.sure else ""
+    clusters, note = around.touched([grip.tips_m[frame] for frame in grip.grasps])
+    return clusters, note if grip.sure else ""
 
 
 def seeds_between(

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from egosim_jax.geometry import UP_AXES, Up, invert, pixels_of, transform, up_of
 from egosim_jax.perception.extent import Candidate, choose_extent, moving_part
 from egosim_jax.perception.grasps import Grip, couplings, is_firm
-from egosim_jax.perception.growth import NEW, Growth, things_without_id
+from egosim_jax.perception.growth import NEW, Growth, clusters_without_id
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.perception.pose_refinement import (
     ColorCost,
@@ -80,7 +80,7 @@ class TrackObjects:
     growth: Growth = field(default_factory=Growth)
     """Segmentation of an object without an id."""
     part: float = 0.9
-    """Maximum size of a moving part, as a fraction of the whole connected thing."""
+    """Maximum size of a moving part, as a fraction of the whole connected cluster."""
     color: ColorCost = field(default_factory=ColorCost)
     """Comparison of the clip's colors with the predicted colors."""
     refinement: Refinement = field(
@@ -194,8 +194,8 @@ def _best_candidate(
         found += [best] if best else []
     if held:
         return min(found, key=lambda candidate: candidate[0], default=None), ""
-    things, note = things_without_id(grip, action.cameras, state, config.growth)
-    for growths in things:
+    clusters, note = clusters_without_id(grip, action.cameras, state, config.growth)
+    for growths in clusters:
         tried = [
             _best_motion(model, grip, 1.0, action.cameras, shown, hidden, config)
             for model in growths
@@ -210,7 +210,7 @@ def _best_candidate(
             found.append(moved[choose_extent(moved, growths, *scene)])
     if found:
         return min(found, key=lambda candidate: candidate[0]), ""
-    if things and grip.sure:
+    if clusters and grip.sure:
         note = "closed on something without an id that the clip shows at rest"
     return None, note
 
@@ -350,7 +350,7 @@ def _gap_below(
     side = 1.0 if first.mean(axis=0) @ normal + offset > 0 else -1.0
     up, floor = side * normal, float(-side * offset)
     # Not the clearance alone: only the visible side has points, so it is not 0 on the ground.
-    # Before the grasp, points above the object's lowest ones are beside it, or left of it.
+    # Before the grasp, points above the object's lowest ones are next to it, or left of it.
     under = others_m[others_m @ up < np.quantile(first @ up, 0.02) + FOOTPRINT_M]
     return up, _clearance(end, others_m, up, floor) - _clearance(first, under, up, floor)
 

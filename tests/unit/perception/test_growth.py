@@ -7,7 +7,7 @@ import pytest
 
 from egosim_jax.geometry import look_at
 from egosim_jax.perception.grasps import Grip
-from egosim_jax.perception.growth import NEW, Growth, things_without_id
+from egosim_jax.perception.growth import NEW, Growth, clusters_without_id
 from egosim_jax.types import Cameras, SceneState
 
 RED, BLUE, WOOD = (200, 30, 30), (30, 40, 190), (150, 140, 120)
@@ -33,11 +33,11 @@ def box(low, high, color, *, sides=3):
     return np.concatenate([face.reshape(-1, 3) for face in faces[:sides]]), color
 
 
-def scene(*things):
-    """Return a state without ids: things on a wooden table."""
+def scene(*clusters):
+    """Return a state without ids: clusters on a wooden table."""
     side = np.arange(-0.3, 0.3, STEP_M)
     table = np.stack(np.meshgrid(side, side, [0.0]), axis=-1).reshape(-1, 3)
-    pieces = [(table, WOOD), *things]
+    pieces = [(table, WOOD), *clusters]
     points = np.concatenate([points for points, _ in pieces]).astype(np.float32)
     return SceneState(
         points_m=points,
@@ -60,10 +60,10 @@ def closed_on(thumb, fingers):
 
 
 def grown(state, grip, config=None):
-    """Return the growths of the only thing in a grip, as numbers of points by color."""
-    things, note = things_without_id(grip, CAMERA, state, config or Growth())
+    """Return the growths of the only cluster in a grip, as numbers of points by color."""
+    clusters, note = clusters_without_id(grip, CAMERA, state, config or Growth())
     assert note == ""
-    (growths,) = things
+    (growths,) = clusters
     assert {model.number for model in growths} == {NEW}
     return [
         {color: int((model.colors == color).all(axis=1).sum()) for color in (RED, BLUE, WOOD)}
@@ -94,7 +94,7 @@ def test_the_lowest_points_of_an_object_are_its_own():
     ],
     ids=["flush", "lower"],
 )
-def test_an_object_that_touches_another_has_a_growth_of_its_own(other):
+def test_an_object_that_touches_another_has_its_own_growth(other):
     growths = grown(scene(CUBE, other), GRIP)
     assert growths[0][BLUE] > 0
     assert any(g[BLUE] == 0 and g[RED] > 0.9 * len(CUBE[0]) for g in growths)
@@ -112,31 +112,31 @@ def test_a_stacked_object_of_the_same_color_ends_at_the_concave_edge():
 
 
 @pytest.mark.parametrize(
-    ("things", "note"),
+    ("clusters", "note"),
     [
         ([], "closed on nothing"),
         ([box((-0.28, -0.02, 0), (0.28, 0.02, 0.04), RED)], "larger than 0.35 m"),
     ],
     ids=["nothing", "too large"],
 )
-def test_why_nothing_is_grown_is_said(things, note):
-    state = scene(*things)
-    lifted = replace(GRIP, tips_m=GRIP.tips_m + [0, 0, 0.0 if things else 0.1])
-    found, said = things_without_id(lifted, CAMERA, state, Growth())
+def test_why_nothing_is_grown_is_said(clusters, note):
+    state = scene(*clusters)
+    lifted = replace(GRIP, tips_m=GRIP.tips_m + [0, 0, 0.0 if clusters else 0.1])
+    found, said = clusters_without_id(lifted, CAMERA, state, Growth())
     assert found == []
     assert note in said
 
 
-def test_a_sheet_that_looks_like_the_table_cannot_be_told_from_it():
+def test_a_sheet_that_looks_like_the_table_is_not_found():
     sheet = box((-0.05, -0.05, 0), (0.05, 0.05, 0.001), WOOD)
     low = replace(GRIP, tips_m=GRIP.tips_m - [0, 0, 0.028])
-    found, said = things_without_id(low, CAMERA, scene(sheet), Growth())
+    found, said = clusters_without_id(low, CAMERA, scene(sheet), Growth())
     assert found == []
-    assert said == "closed on something that cannot be told from its support"
+    assert said == "closed on something that looks like its support"
 
 
 def test_points_with_an_id_are_not_grown():
     state = scene(CUBE)
     red = (state.colors == RED).all(axis=1)
     known = replace(state, object_ids=red.astype(np.int32))
-    assert things_without_id(GRIP, CAMERA, known, Growth())[0] == []
+    assert clusters_without_id(GRIP, CAMERA, known, Growth())[0] == []
