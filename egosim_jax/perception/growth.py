@@ -23,6 +23,8 @@ from egosim_jax.types import Cameras, SceneState
 
 NEW = 0
 """Number of an object that has no id yet."""
+SEAM_COLORS = 8
+"""Number of nearest points whose colors a point at a border between objects is compared with."""
 NEIGHBORS = 16
 """Number of nearest points that determine a point's normal."""
 HOLLOW = 0.15
@@ -222,7 +224,7 @@ class Surroundings:
         ):
             if core.sum() < self.config.min_points:
                 continue
-            members = self.with_crumbs(core)
+            members = self.with_crumbs(self.with_seam(core, whole))
             if any((members & old).sum() > 0.95 * (members | old).sum() for old in found):
                 continue
             found.append(members)
@@ -238,21 +240,40 @@ class Surroundings:
         Such pieces are a seam along its edge, whose points mix two colors or, where the surface
         turns away from the camera, are far behind each other.
         """
-        from scipy.spatial import KDTree
-
         parts = self.parts(~members)
         (rest,) = np.nonzero(~members)
         if not len(rest):
             return members
-        gaps, nearest = KDTree(self.points_m[members]).query(self.points_m[rest])
-        ray = self.points_m[rest] - self.eye_m
-        step = self.points_m[members][nearest] - self.points_m[rest]
-        aside = np.linalg.norm(np.cross(step, ray), axis=1) / np.linalg.norm(ray, axis=1)
-        near = (gaps <= 3 * self.radius_m) & (aside <= 1.5 * self.radius_m)
+        near = self._is_beside(rest, members)
         count, close = (np.bincount(parts[rest], weights) for weights in (None, near))
         piece = (close > 0) & ((count < self.config.min_points) | (close >= 0.9 * count))
         grown = members.copy()
         grown[rest] = piece[parts[rest]]
+        return grown
+
+    def with_seam(
+        self, members: Bool[np.ndarray, " n"], whole: Bool[np.ndarray, " n"]
+    ) -> Bool[np.ndarray, " n"]:
+        """Return an object's points with those at its border whose color it has.
+
+        At a concave edge to another object, the shape does not say which points are on which side.
+        """
+        from scipy.spatial import KDTree
+
+        (outside,) = np.nonzero(whole & ~members)
+        beside = self._is_beside(outside, members)
+        seam, rest = outside[beside], outside[~beside]
+        if not len(seam) or len(rest) < SEAM_COLORS:
+            return members
+
+        def difference(others: Int[np.ndarray, " m"]) -> Float[np.ndarray, " s"]:
+            nearest = KDTree(self.points_m[others]).query(self.points_m[seam], SEAM_COLORS)[1]
+            colors, own = self.colors[others][nearest], self.colors[seam][:, None]
+            light = (own * colors).sum(axis=2) / np.maximum((colors**2).sum(axis=2), 1)
+            return np.linalg.norm(own - light[..., None] * colors, axis=2).min(axis=1)
+
+        grown = members.copy()
+        grown[seam] = difference(np.flatnonzero(members)) < difference(rest)
         return grown
 
     def model(self, members: Bool[np.ndarray, " n"]) -> ObjectModel:
@@ -277,6 +298,18 @@ class Surroundings:
             colors=np.concatenate([colors, self.low_colors[feet]]),
             plane=self.plane,
         )
+
+    def _is_beside(
+        self, others: Int[np.ndarray, " k"], members: Bool[np.ndarray, " n"]
+    ) -> Bool[np.ndarray, " k"]:
+        """Return which other points are next to an object, as the camera sees them."""
+        from scipy.spatial import KDTree
+
+        gaps, nearest = KDTree(self.points_m[members]).query(self.points_m[others])
+        ray = self.points_m[others] - self.eye_m
+        step = self.points_m[members][nearest] - self.points_m[others]
+        aside = np.linalg.norm(np.cross(step, ray), axis=1) / np.linalg.norm(ray, axis=1)
+        return (gaps <= 3 * self.radius_m) & (aside <= 1.5 * self.radius_m)
 
     def _around(
         self, seeds: Int[np.ndarray, " s"], parts: Int[np.ndarray, " n"]
