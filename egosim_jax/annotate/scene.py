@@ -85,10 +85,12 @@ def _lifted(record: Record) -> Float[np.ndarray, "f 2 21 3"]:
 def refine_scale(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
     """Scale the scene so that fingertips have the depth of the objects that they start to move.
 
-    This replaces a scale from hands that may have touched the scene at any time.
+    This replaces a scale from hands that may have touched the scene at any time. An assumed plane
+    moves behind these objects.
     """
     from egosim_jax.perception.scale import contact_scale, scale_cameras
 
+    record = replace(record, depth=stand_out(record))
     contacts, joints_m = record.require("contacts"), record.joints_m
     if record.notes["scale"]["source"] != "hands" or joints_m is None or not len(contacts):
         return record
@@ -106,6 +108,20 @@ def refine_scale(record: Record, estimators: Estimators, config: AnnotateConfig)
         depth=replace(depth, depth_m=(depth.depth_m * factor).astype(np.float32)),
     )  # fmt: skip
     return replace(record, joints_m=joints_in_world(record))
+
+
+def stand_out(record: Record) -> DepthEstimate:
+    """Return the depth with an assumed plane moved behind the moved objects, by their width."""
+    depth, own = record.require("depth"), record.moved[0]
+    if depth.confident.any() or not own.any():
+        return depth
+    numbers = record.require("moved_ids")
+    ids = record.require("object_ids")[0]
+    sides = [np.ptp(np.argwhere(ids == n), axis=0).min() + 1 for n in numbers if (ids == n).any()]
+    factor = 1 + max(sides) / record.cameras.intrinsics_px[0, 0]
+    depth_m = depth.depth_m * np.float32(factor)
+    depth_m[0][own] = depth.depth_m[0][own]
+    return replace(depth, depth_m=depth_m)
 
 
 def _sparse_depth(record: Record) -> DepthEstimate:

@@ -24,8 +24,10 @@ TIPS: dict[Kind, list[int]] = {"human": [4, 8, 12], "robot": [1, 2]}
 """Grasping joints: tips of thumb, index and middle finger; both jaws of a gripper."""
 MIN_HELD = 2
 """Minimum number of frames between a grasp and a release."""
-MAX_NOISE = 0.25
-"""Maximum noise of the opening, as its median second difference in tolerances of a hold."""
+MAX_NOISE = 0.1
+"""Maximum noise of the opening: the 25th percentile of its bends, in tolerances of a hold."""
+MIN_BENDS = 8
+"""Minimum number of bends that show the noise of an opening."""
 MAX_ENDS = 24
 """Maximum number of frames at which a hold may begin or end if the opening is no evidence."""
 MAX_DEPTH_M = 0.06
@@ -137,7 +139,8 @@ def find_holds(
     """
     opening = np.linalg.norm(tips_m[:, 0] - tips_m[:, 1:].mean(axis=1), axis=-1)
     pairs = [(g, r) for g, r in combinations(range(len(tips_m)), 2) if r - g >= MIN_HELD]
-    noise = np.median(np.abs(np.diff(opening, 2))) if len(opening) > MIN_HELD else 0.0
+    bends = np.abs(np.diff(opening, 2))
+    noise = np.percentile(bends, 25) if len(bends) >= MIN_BENDS else 0.0
     if np.ptp(opening) <= tolerance_m or noise > MAX_NOISE * tolerance_m:
         ends = set(np.linspace(0, len(opening) - 1, MAX_ENDS).astype(int).tolist())
         return [pair for pair in pairs if ends.issuperset(pair)], False

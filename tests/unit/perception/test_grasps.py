@@ -6,6 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from egosim_jax.geometry import transform
 from egosim_jax.perception.grasps import (
+    MAX_ENDS,
+    Grip,
+    complete_hand,
     couplings,
     find_holds,
     hinge_motion,
@@ -13,6 +16,7 @@ from egosim_jax.perception.grasps import (
     is_between,
     is_firm,
     palm_motion,
+    seen_frames,
 )
 
 TOLERANCE_M = 0.01
@@ -178,3 +182,25 @@ def test_a_grip_is_firm_if_both_sides_are_touched_and_it_leaves(low_cm, high_cm,
     tips[:, 1:, 0] = 0.05
     tips[:, :, 2] = np.linspace(0, travel_cm / 100, 6)[:, None]
     assert is_firm(faces, tips, (0, 5)) == firm
+def test_a_noisy_opening_is_no_evidence_of_a_hold():
+    tips = np.zeros((60, 3, 3))
+    tips[20:40, 1:, 0] = 0.04
+    tips[:20, 1:, 0] = tips[40:, 1:, 0] = 0.09
+    assert find_holds(tips, TOLERANCE_M) == ([(20, 39)], True)
+    tips[:, 1:, 0] += np.random.default_rng(0).normal(0, 0.005, (60, 1))
+    holds, sure = find_holds(tips, TOLERANCE_M)
+    assert not sure
+    assert MAX_ENDS * (MAX_ENDS - 1) / 2 - MAX_ENDS <= len(holds) <= MAX_ENDS**2 / 2
+    assert {0, 59} <= {frame for hold in holds for frame in hold}
+
+
+def test_a_hand_rests_where_it_enters_and_leaves_and_is_interpolated_in_between():
+    joints = np.full((8, 21, 3), np.nan)
+    for frame in (2, 3, 5):
+        joints[frame] = np.random.default_rng(1).normal(0, 0.05, (21, 3)) + frame
+    complete = complete_hand(joints, seen_frames(joints))
+    step = (complete - complete[2]).mean(axis=(1, 2))
+    np.testing.assert_allclose(step, [0, 0, 0, 1, 2, 3, 3, 3], atol=1e-9)
+    eyes = np.zeros((8, 3))
+    grip = Grip.of(joints, "human", eyes, tolerance_m=TOLERANCE_M, radius_m=0.01)
+    assert grip.holds == [(2, 4), (2, 5), (3, 5)]
