@@ -70,7 +70,9 @@ class MakeEpisode:
         """Make, check and write the episode."""
         check_counts({"--clips": self.clips})
         check_seed(self.seed or 0)
-        return _save(self._own() if self.actions else self._tabletop(), self.out)
+        if not self.actions:
+            return _save(self._tabletop(), self.out)
+        return _save(self._own(), self.out, describe=True)
 
     def _tabletop(self) -> episodes.Episode:
         from egosim_jax import configs
@@ -196,7 +198,7 @@ class FromAnnotation:
 
         check_counts({"--clips": self.clips})
         episode = episode_from(self.clip, configs.get(self.config).video, clips=self.clips)
-        return _save(episode, self.out)
+        return _save(episode, self.out, describe=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,7 +234,7 @@ class FromLeRobot:
         episode = episode_from_lerobot(
             self.dataset, self.episode, video, state=state, clips=self.clips
         )
-        return _save(episode, self.out)
+        return _save(episode, self.out, describe=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -332,13 +334,14 @@ def _read_state(path: Path) -> SceneState:
     return (read_ply if path.suffix == ".ply" else load)(path)
 
 
-def _save(episode: episodes.Episode, out: Path) -> int:
-    """Check and write the episode; print its summary and its objects."""
-    from egosim_jax.cli.objects import describe_objects
-
+def _save(episode: episodes.Episode, out: Path, *, describe: bool = False) -> int:
+    """Check and write the episode; print its summary and, with `describe`, its objects."""
     episode.save(out)
     print(f"{out}: {summary(episode)}")
-    print(describe_objects(episode.state))
+    if describe:
+        from egosim_jax.cli.objects import describe_objects
+
+        print(describe_objects(episode.state))
     return ExitCode.DONE
 
 

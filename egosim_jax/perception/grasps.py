@@ -34,6 +34,12 @@ MIN_ARC_DEG = 25.0
 """Minimum angle of an arc, in degrees; a shorter arc does not determine its axis."""
 MAX_ARC_ERROR = 0.05
 """Maximum distance of the fingertips from an arc, as a fraction of its radius."""
+FIRM_RADIUS_M = 0.025
+"""Distance from the line through the fingertips within which an object fills a grip, in meters."""
+FIRM_SLACK_M = (0.008, 0.035)
+"""Maximum depth of a fingertip in the object that it holds, and maximum free space between them."""
+FIRM_TRAVEL_M = 0.03
+"""Minimum distance that a hand carries what it holds firmly, in meters."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +88,7 @@ class Grip:
 
     @cached_property
     def hinges(self) -> dict[tuple[int, int], Float[np.ndarray, "f 4 4"] | None]:
-        """Motion about a hinge in each hold; None where there is none."""
+        """Motion about a hinge in each hold; None without a hinge."""
         return {hold: hinge_motion(self.tips_m, hold) for hold in self.holds}
 
     def has(self, points_m: Float[np.ndarray, "n 3"], grasped: int) -> bool:
@@ -145,6 +151,29 @@ def is_between(
     share = (points_m - thumb) @ across / max(across @ across, 1e-12)
     away = np.linalg.norm(points_m - thumb - share[:, None] * across, axis=1)
     return bool(((share > 0) & (share < 1) & (away <= radius_m)).any())
+
+
+def is_firm(
+    points_m: Float[np.ndarray, "n 3"], tips_m: Float[np.ndarray, "f j 3"], hold: tuple[int, int]
+) -> bool:
+    """Return True if the fingertips close on two sides of an object, and then carry it away.
+
+    The object must fit between them and fill the space, at the grasp. Only the visible side of an
+    object has points, so it may be somewhat narrower than the grip.
+    """
+    grasped, released = hold
+    thumb, fingers = tips_m[:, 0], tips_m[:, 1:].mean(axis=1)
+    middle = (thumb + fingers)[grasped : released + 1] / 2
+    if np.linalg.norm(middle - middle[0], axis=1).max() < FIRM_TRAVEL_M:
+        return False
+    opening = float(np.linalg.norm(fingers[grasped] - thumb[grasped]))
+    across = (fingers[grasped] - thumb[grasped]) / max(opening, 1e-9)
+    along = (points_m - thumb[grasped]) @ across
+    away = np.linalg.norm(points_m - thumb[grasped] - along[:, None] * across, axis=1)
+    held = along[away <= FIRM_RADIUS_M]
+    inside, slack = FIRM_SLACK_M
+    fits = len(held) > 0 and held.min() >= -inside and held.max() <= opening + inside
+    return bool(fits and opening - np.ptp(held) <= slack)
 
 
 def palm_motion(palm_m: Float[np.ndarray, "f j 3"], grasped: int) -> Float[np.ndarray, "f 4 4"]:

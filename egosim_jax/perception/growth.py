@@ -24,9 +24,15 @@ from egosim_jax.types import Cameras, SceneState
 NEW = 0
 """Number of an object that has no id yet."""
 NEIGHBORS = 16
-"""Number of nearest points that determine a point's normal and its edges."""
-MIN_PLANE_M = 0.002
+"""Number of nearest points that determine a point's normal."""
+HOLLOW = 0.15
+"""Minimum fraction of concave pairs of a point at a concave edge."""
+MAX_SEEDS = 20
+"""Maximum number of points between the fingertips that give an object's color."""
+MIN_HEIGHT_M = 0.002
 """Minimum height above the supporting plane at which a point is not on it, in meters."""
+MAX_NOISE_M = 0.006
+"""Distance from the plane within which the median distance is its noise, in meters."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,41 +46,60 @@ class Growth:
     spacings: float = 2.5
     """Maximum distance of connected points, in median distances of nearest points."""
     concave: float = 0.2
-    """Height of neighbors above a point's tangent plane at a concave edge, per distance."""
+    """Height of a point above a neighbor's tangent plane at a concave edge, per distance."""
     edge_deg: float = 25.0
     """Angle between the normals of neighbors at an edge, in degrees."""
-    color_levels: float = 45.0
-    """Difference in color, whatever the light, of points of different objects, in 8-bit levels."""
+    color_levels: tuple[float, ...] = (45.0, 18.0)
+    """Differences in color at which growths end, whatever the light, in 8-bit levels."""
     min_points: int = 30
     """Minimum number of points of an object."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Surroundings:
-    """Points without an id around a hand, and the plane that supports them."""
+    """Points without an id around a hand: those above the supporting plane, and those near it."""
 
     points_m: Float32[np.ndarray, "n 3"]
+    """Points above the plane."""
     colors: Float32[np.ndarray, "n 3"]
+    low_m: Float32[np.ndarray, "m 3"]
+    """Points of the plane, and points as near to it as its noise."""
+    low_colors: Float32[np.ndarray, "m 3"]
     plane: Float[np.ndarray, " 4"]
-    """Plane a x + b y + c z + d = 0, whose normal points to the side of the objects."""
+    """Plane a x + b y + c z + d = 0 with the normal up; d is NaN if there is no plane."""
     eye_m: Float[np.ndarray, " 3"]
     """Place of the camera, which sees the outside of the surfaces."""
     config: Growth
 
-    @cached_property
-    def heights_m(self) -> Float[np.ndarray, " n"]:
-        """Heights above the plane in meters; infinite without a plane."""
-        if np.isnan(self.plane[3]):
-            return np.full(len(self.points_m), np.inf)
-        return self.points_m @ self.plane[:3] + self.plane[3]
-
-    @cached_property
-    def raised(self) -> Bool[np.ndarray, " n"]:
-        """Points above the plane by more than its points are apart from it."""
-        near = np.abs(self.heights_m)
-        inliers = near[near < 3 * MIN_PLANE_M]
-        noise = 1.4826 * float(np.median(inliers)) if len(inliers) else 0.0
-        return self.heights_m > max(MIN_PLANE_M, 3 * noise)
+    @classmethod
+    def of(
+        cls,
+        state: SceneState,
+        chosen: Int[np.ndarray, " k"],
+        eye_m: Float[np.ndarray, " 3"],
+        config: Growth,
+    ) -> Surroundings:
+        """Return the surroundings of a hand from the chosen points of a state."""
+        points, colors = state.points_m[chosen], state.colors[chosen].astype(np.float32)
+        up = np.array(UP_AXES[up_of(state)])
+        looks_down = up_of(state) == "-y"  # the first camera's own axis, far from the vertical
+        surfaces = support_planes(points, up, eye_m=eye_m if looks_down else None)
+        plane = surfaces[0].plane if surfaces else np.array([*up, np.nan])
+        heights = points @ plane[:3] + plane[3]
+        near = np.abs(heights)
+        near = near[near < MAX_NOISE_M]
+        noise = 1.4826 * float(np.median(near)) if len(near) else 0.0
+        raised = ~(heights <= max(MIN_HEIGHT_M, 3 * noise))
+        low = ~raised & (np.abs(heights) <= max(MAX_NOISE_M, 3 * noise))
+        return cls(
+            points_m=points[raised],
+            colors=colors[raised],
+            low_m=points[low],
+            low_colors=colors[low],
+            plane=plane,
+            eye_m=eye_m,
+            config=config,
+        )
 
     @cached_property
     def neighbors(self) -> Int[np.ndarray, "n k"]:
@@ -87,8 +112,8 @@ class Surroundings:
     @cached_property
     def radius_m(self) -> float:
         """Maximum distance of connected points in meters."""
-        gaps = self.points_m[self.neighbors[:, 1]] - self.points_m
-        return self.config.spacings * float(np.median(np.linalg.norm(gaps, axis=1)))
+        gaps = self.points_m[self.neighbors[:, 1:2]] - self.points_m[:, None]
+        return self.config.spacings * float(np.median(np.linalg.norm(gaps, axis=2)))
 
     @cached_property
     def normals(self) -> Float[np.ndarray, "n 3"]:
@@ -100,22 +125,33 @@ class Surroundings:
         return np.where(inward[:, None], -normals, normals)
 
     @cached_property
-    def hollow(self) -> Bool[np.ndarray, " n"]:
-        """Points at a concave edge: the points around them are above their tangent planes."""
-        steps = self.points_m[self.neighbors[:, 1:]] - self.points_m[:, None]
-        rise = np.einsum("nki,ni->nk", steps, self.normals).mean(axis=1)
-        return rise > self.config.concave * np.linalg.norm(steps, axis=2).mean(axis=1)
-
-    @cached_property
     def pairs(self) -> Int[np.ndarray, "p 2"]:
-        """Pairs of connected points above the plane."""
+        """Pairs of connected points."""
         from scipy.spatial import KDTree
 
-        (own,) = np.nonzero(self.raised)
-        if not len(own):
-            return np.zeros((0, 2), int)
-        tree = KDTree(self.points_m[own])
-        return own[tree.query_pairs(self.radius_m, output_type="ndarray")]
+        return KDTree(self.points_m).query_pairs(self.radius_m, output_type="ndarray")
+
+    @cached_property
+    def bends(self) -> Float[np.ndarray, "p 3"]:
+        """Difference of the normals of each pair."""
+        one, other = self.pairs.T
+        return self.normals[one] - self.normals[other]
+
+    @cached_property
+    def concave(self) -> Bool[np.ndarray, " p"]:
+        """Pairs across a concave edge: each point is above the other's tangent plane."""
+        one, other = self.pairs.T
+        steps = self.points_m[other] - self.points_m[one]
+        rise = (self.bends * steps).sum(axis=1) / 2
+        return rise > self.config.concave * np.linalg.norm(steps, axis=1)
+
+    @cached_property
+    def hollow(self) -> Bool[np.ndarray, " n"]:
+        """Points at a concave edge."""
+        count = len(self.points_m)
+        every = np.bincount(self.pairs.ravel(), minlength=count)
+        concave = np.bincount(self.pairs[self.concave].ravel(), minlength=count)
+        return concave > HOLLOW * every
 
     def parts(
         self, members: Bool[np.ndarray, " n"], cut: Bool[np.ndarray, " p"] | None = None
@@ -137,54 +173,56 @@ class Surroundings:
 
     def touched(
         self, grips: Sequence[Float[np.ndarray, "j 3"]]
-    ) -> tuple[list[list[Bool[np.ndarray, " n"]]], str]:
-        """Return the growths of each thing that one of the grips touches, and a note.
+    ) -> tuple[list[list[ObjectModel]], str]:
+        """Return the growths of each cluster that one of the grips touches, and a note.
 
         A grip is the places of the fingertips. The note says why there is no growth.
         """
-        parts = self.parts(self.raised)
-        things: dict[int, list[Bool[np.ndarray, " n"]]] = {}
+        clusters: dict[int, list[ObjectModel]] = {}
         notes = ["closed on nothing"]
+        everything = np.ones(len(self.points_m), bool)
+        parts = self.parts(everything) if len(everything) > 1 else np.zeros(len(everything), int)
         for tips in grips:
-            seeds = seeds_between(self.points_m, self.raised, tips, self.config.reach_m)
+            seeds = seeds_between(self.points_m, tips, self.config.reach_m)
             if not len(seeds):
-                flat = seeds_between(self.points_m, ~self.raised, tips, self.config.reach_m / 2)
-                if len(flat):
-                    notes.append("closed on something that cannot be told from its support")
+                if len(seeds_between(self.low_m, tips, self.config.reach_m / 2)):
+                    notes.append("closed on something that looks like its support")
                 continue
             part = int(np.bincount(parts[seeds]).argmax())
-            if part in things:
+            if part in clusters:
                 continue
-            growths = list(self.grow(seeds))
-            things[part] = [
-                self.skirt(members)
-                for members in growths
-                if self.extent_m(members) <= self.config.max_extent_m
-            ]
-            if not growths:
+            if (parts == part).sum() < self.config.min_points:
                 notes.append("closed on too few points to be an object")
-            elif not things[part]:
-                notes.append(
-                    f"closed on something without an id that is larger than "
-                    f"{self.config.max_extent_m} m: it was not moved"
-                )
-        found = [growths for growths in things.values() if growths]
+                continue
+            growths = list(self.grow(seeds[parts[seeds] == part], parts == part))
+            small = [g for g in growths if self.extent_m(g) <= self.config.max_extent_m]
+            clusters[part] = [self.model(members) for members in small]
+            if not small:
+                limit = self.config.max_extent_m
+                notes.append(f"closed on something larger than {limit} m: it was not moved")
+        found = [growths for growths in clusters.values() if growths]
         return found, "" if found else notes[-1]
 
-    def grow(self, seeds: Int[np.ndarray, " s"]) -> Iterator[Bool[np.ndarray, " n"]]:
-        """Yield the points of the possible objects around the seeds, the largest first."""
-        whole = self._around(seeds, self.parts(self.raised))
-        convex = self._fill(self._around(seeds, self.parts(whole & ~self.hollow)), whole)
-        alike = self._alike(seeds)
-        one, other = self.pairs.T
-        bent = (self.normals[one] * self.normals[other]).sum(axis=1)
-        sharp = bent < np.cos(np.radians(self.config.edge_deg))
-        face = self._around(seeds, self.parts(whole & ~self.hollow, sharp))
-        same = self._around(seeds, self.parts(whole & alike))
+    def grow(
+        self, seeds: Int[np.ndarray, " s"], whole: Bool[np.ndarray, " n"]
+    ) -> Iterator[Bool[np.ndarray, " n"]]:
+        """Yield the points of the possible objects around seeds in a part, the largest first."""
+        flat = whole & ~self.hollow
+        sharp = np.linalg.norm(self.bends, axis=1) > np.radians(self.config.edge_deg)
+        convex = self._fill(self._around(seeds, self.parts(flat, self.concave)), whole)
+        difference = self._difference(seeds)
+        alike = [difference < levels for levels in self.config.color_levels]
         found: list[Bool[np.ndarray, " n"]] = []
-        for members in (whole, convex, same, self._around(seeds, self.parts(convex & alike)), face):
-            if members.sum() < self.config.min_points:
+        for core in (
+            whole,
+            convex,
+            *(self._around(seeds, self.parts(whole & same)) for same in alike),
+            *(self._around(seeds, self.parts(convex & same)) for same in alike),
+            self._around(seeds, self.parts(flat, sharp)),
+        ):
+            if core.sum() < self.config.min_points:
                 continue
+            members = self.with_crumbs(core)
             if any((members & old).sum() > 0.95 * (members | old).sum() for old in found):
                 continue
             found.append(members)
@@ -194,29 +232,51 @@ class Surroundings:
         """Return the longest side of the box around some points in meters."""
         return float(np.ptp(self.points_m[members], axis=0).max())
 
-    def skirt(self, members: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-        """Return an object's points with its lowest ones, which are near the plane.
+    def with_crumbs(self, members: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+        """Return an object's points with the pieces next to it that are too small for an object.
 
-        They are next to the object, and look like it or stand upright as the plane does not.
+        Such pieces are a seam along its edge, whose points mix two colors or, where the surface
+        turns away from the camera, are far behind each other.
         """
         from scipy.spatial import KDTree
 
-        low = ~self.raised & (self.heights_m > -MIN_PLANE_M)
-        (candidates,) = np.nonzero(low)
-        if not len(candidates):
+        parts = self.parts(~members)
+        (rest,) = np.nonzero(~members)
+        if not len(rest):
             return members
-        gaps, nearest = KDTree(self.points_m[members]).query(
-            self.points_m[candidates], distance_upper_bound=2 * self.radius_m
-        )
-        candidates, nearest = candidates[np.isfinite(gaps)], nearest[np.isfinite(gaps)]
-        ground = np.median(self.colors[low], axis=0)
-        like_object = np.linalg.norm(
-            self.colors[candidates] - self.colors[members][nearest], axis=1
-        )
-        like_ground = np.linalg.norm(self.colors[candidates] - ground, axis=1)
+        gaps, nearest = KDTree(self.points_m[members]).query(self.points_m[rest])
+        ray = self.points_m[rest] - self.eye_m
+        step = self.points_m[members][nearest] - self.points_m[rest]
+        aside = np.linalg.norm(np.cross(step, ray), axis=1) / np.linalg.norm(ray, axis=1)
+        near = (gaps <= 3 * self.radius_m) & (aside <= 1.5 * self.radius_m)
+        count, close = (np.bincount(parts[rest], weights) for weights in (None, near))
+        piece = (close > 0) & ((count < self.config.min_points) | (close >= 0.9 * count))
         grown = members.copy()
-        grown[candidates[like_object < like_ground]] = True
+        grown[rest] = piece[parts[rest]]
         return grown
+
+    def model(self, members: Bool[np.ndarray, " n"]) -> ObjectModel:
+        """Return the model of an object with its feet: its points that are near the plane.
+
+        They are next to the object, and look more like it than like the plane.
+        """
+        from scipy.spatial import KDTree
+
+        points, colors = self.points_m[members], self.colors[members]
+        feet = np.zeros(len(self.low_m), bool)
+        if len(feet):
+            gaps, nearest = KDTree(points).query(self.low_m, distance_upper_bound=2 * self.radius_m)
+            (close,) = np.nonzero(np.isfinite(gaps))
+            ground = np.median(self.low_colors, axis=0)
+            to_object = np.linalg.norm(self.low_colors[close] - colors[nearest[close]], axis=1)
+            to_ground = np.linalg.norm(self.low_colors[close] - ground, axis=1)
+            feet[close] = to_object < to_ground
+        return ObjectModel(
+            number=NEW,
+            points_m=np.concatenate([points, self.low_m[feet]]).astype(float),
+            colors=np.concatenate([colors, self.low_colors[feet]]),
+            plane=self.plane,
+        )
 
     def _around(
         self, seeds: Int[np.ndarray, " s"], parts: Int[np.ndarray, " n"]
@@ -243,19 +303,20 @@ class Surroundings:
         filled[edges] = members[nearest]
         return filled
 
-    def _alike(self, seeds: Int[np.ndarray, " s"]) -> Bool[np.ndarray, " n"]:
-        """Return the points in the color of the seeds under any light."""
-        own = np.median(self.colors[seeds], axis=0)
+    def _difference(self, seeds: Int[np.ndarray, " s"]) -> Float[np.ndarray, " n"]:
+        """Return the difference of each point's color from the seeds' under any light."""
+        own = np.median(self.colors[seeds[:MAX_SEEDS]], axis=0)
         light = (self.colors @ own) / max(float(own @ own), 1.0)
-        return np.linalg.norm(self.colors - light[:, None] * own, axis=1) < self.config.color_levels
+        return np.linalg.norm(self.colors - light[:, None] * own, axis=1)
 
 
-def things_without_id(
+def clusters_without_id(
     grip: Grip, cameras: Cameras, state: SceneState, config: Growth
 ) -> tuple[list[list[ObjectModel]], str]:
-    """Return the growths of each thing without an id that a hand touches, and a note.
+    """Return the growths of each cluster without an id that a hand touches, and a note.
 
-    The note says why a hand that surely held something has no growth.
+    The growths of a cluster begin with the largest. The note says why a hand that surely held
+    something has no growth.
     """
     pinches = grip.tips_m[grip.grasps].mean(axis=1)
     free = np.flatnonzero(state.object_ids == 0)
@@ -263,38 +324,15 @@ def things_without_id(
     free = free[np.min(gaps, axis=0) <= config.max_extent_m]
     if len(free) < config.min_points:
         return [], "closed on nothing" if grip.sure else ""
-    points, eye = state.points_m[free], cameras.world_from_camera[0, :3, 3]
-    surfaces = support_planes(points, np.array(UP_AXES[up_of(state)]))
-    around = Surroundings(
-        points_m=points,
-        colors=state.colors[free].astype(np.float32),
-        plane=surfaces[0].plane if surfaces else np.array([*UP_AXES[up_of(state)], np.nan]),
-        eye_m=eye,
-        config=config,
-    )
-    found, note = around.touched([grip.tips_m[frame] for frame in grip.grasps])
-    things = [
-        [
-            ObjectModel(
-                number=NEW,
-                points_m=points[members].astype(float),
-                colors=around.colors[members],
-                plane=around.plane,
-            )
-            for members in growths
-        ]
-        for growths in found
-    ]
-    return things, note if grip.sure else ""
+    around = Surroundings.of(state, free, cameras.world_from_camera[0, :3, 3], config)
+    clusters, note = around.touched([grip.tips_m[frame] for frame in grip.grasps])
+    return clusters, note if grip.sure else ""
 
 
 def seeds_between(
-    points_m: Float[np.ndarray, "n 3"],
-    chosen: Bool[np.ndarray, " n"],
-    tips_m: Float[np.ndarray, "j 3"],
-    reach_m: float,
+    points_m: Float[np.ndarray, "n 3"], tips_m: Float[np.ndarray, "j 3"], reach_m: float
 ) -> Int[np.ndarray, " s"]:
-    """Return the chosen points nearest to the line from the thumb to the fingers.
+    """Return the points nearest to the line from the thumb to the fingers, from its middle.
 
     Points within 5 mm more than the nearest one's distance count; none beyond `reach_m`.
     """
@@ -302,8 +340,8 @@ def seeds_between(
     across = fingers - thumb
     share = np.clip((points_m - thumb) @ across / max(across @ across, 1e-12), 0, 1)
     away = np.linalg.norm(points_m - thumb - share[:, None] * across, axis=1)
-    away = np.where(chosen, away, np.inf)
     nearest = float(away.min(initial=np.inf))
     if nearest > reach_m:
         return np.zeros(0, int)
-    return np.flatnonzero(away <= nearest + 0.005)
+    seeds = np.flatnonzero(away <= nearest + 0.005)
+    return seeds[np.argsort(np.abs(share[seeds] - 0.5), kind="stable")]

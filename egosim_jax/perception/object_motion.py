@@ -4,8 +4,9 @@ A grasped object moves with the hand. A candidate combines an object near a fing
 of a possible hold, and a motion of the hand that the object may follow (`grasps`). Its cost is the
 mean difference between the object's colors and the clip's colors where the object would be visible.
 The candidate that most improves on the object at rest is accepted. An object between the closing
-fingertips counts as moved unless the clip clearly shows it at rest. A released object falls
-(`fall`), and `pose_refinement` refines its last pose.
+fingertips counts as moved unless the clip clearly shows it at rest. If they hold nothing with an
+id, candidates are grown from the points between them (`growth`), and `extent` chooses how far. A
+released object falls (`fall`) or is put down (`snap`), and `pose_refinement` refines its last pose.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from egosim_jax.geometry import UP_AXES, Up, invert, pixels_of, transform, up_of
-from egosim_jax.perception.extent import choose_extent
-from egosim_jax.perception.grasps import MIN_HELD, Grip, couplings, seen_frames
-from egosim_jax.perception.growth import NEW, Growth, things_without_id
+from egosim_jax.perception.extent import Candidate, choose_extent, moving_part
+from egosim_jax.perception.grasps import MIN_HELD, Grip, couplings, is_firm, seen_frames
+from egosim_jax.perception.growth import NEW, Growth, clusters_without_id
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.perception.pose_refinement import (
     ColorCost,
@@ -38,6 +39,8 @@ MIN_LIFT_M = 0.01
 """Minimum height of a release above the first height, in meters; below it nothing falls."""
 FOOTPRINT_M = 0.006
 """Horizontal distance within which the state's points are below an object, in meters."""
+SNAP_M = 0.02
+"""Maximum height error of a released object, above or below its support, in meters."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +65,10 @@ class TrackObjects:
     """Maximum distance of a gripped object from the line between the fingertips, in meters."""
     grip_evidence: float = 8.0
     """Maximum cost of a gripped object's motion above the cost at rest, in 8-bit levels."""
+    firm_evidence: float = 60.0
+    """The same for an object that a hand holds firmly and carries away.
+
+    A generated clip may leave an object where the state has it, as if no hand had taken it."""
     prompt_prior: float = 0.9
     """Cost factor of an object that the prompt names."""
     plane_tolerance_m: float = 0.006
@@ -72,10 +79,12 @@ class TrackObjects:
     """Sigma of the Gaussian blur of the clip: generated frames are softer than points."""
     growth: Growth = field(default_factory=Growth)
     """Segmentation of an object without an id."""
+    part: float = 0.9
+    """Maximum size of a moving part, as a fraction of the whole connected cluster."""
     color: ColorCost = field(default_factory=ColorCost)
     """Comparison of the clip's colors with the predicted colors."""
     refinement: Refinement = field(
-        default_factory=partial(Refinement, deviation_m=0.005, deviation_deg=5.0)
+        default_factory=partial(Refinement, deviation_m=0.003, deviation_deg=5.0)
     )
     """Refinement of the object's last pose."""
 
@@ -144,18 +153,15 @@ def estimate_object_motion(
             if best is not None:
                 change, motion = best
                 others = state.points_m[state.object_ids != motion.model.number]
-                motion = fall(motion, others, clip.fps)
+                motion = snap(fall(motion, others, clip.fps), others)
                 motion = refine_pose(
                     motion, action.cameras, state, shown, hidden, config.refinement, config.color
                 )
+                motion = snap(motion, others)
                 number = motion.model.number
                 if number not in found or change < found[number][0]:
                     found[number] = change, motion
     return [motion for _, motion in found.values()], new, notes
-
-
-_Candidate = tuple[float, ObjectMotion]
-"""Change of the cost by a motion, less the highest accepted one; and the motion."""
 
 
 def _best_candidate(
@@ -165,7 +171,7 @@ def _best_candidate(
     shown: Float32[np.ndarray, "f h w 3"],
     hidden: Bool[np.ndarray, "f h w"],
     config: TrackObjects,
-) -> tuple[_Candidate | None, str]:
+) -> tuple[Candidate | None, str]:
     """Return the best accepted candidate of one hand, and a note.
 
     If the hand holds no object that has an id, it may move one that has none.
@@ -173,7 +179,7 @@ def _best_candidate(
     grip = Grip.of(
         joints_m, action.kind, tolerance_m=config.opening_tolerance_m, radius_m=config.grip_radius_m
     )
-    found: list[_Candidate] = []
+    found: list[Candidate] = []
     held = False
     for number in _near_tips(grip.tips_m, state, config):
         model = object_model(number, state, config)
@@ -184,21 +190,25 @@ def _best_candidate(
         found += [best] if best else []
     if held:
         return min(found, key=lambda candidate: candidate[0], default=None), ""
-    things, note = things_without_id(grip, action.cameras, state, config.growth)
-    for growths in things:
-        moved = [
+    clusters, note = clusters_without_id(grip, action.cameras, state, config.growth)
+    for growths in clusters:
+        tried = [
             _best_motion(model, grip, 1.0, action.cameras, shown, hidden, config)
             for model in growths
         ]
-        moved = [best for best in moved if best is not None]
+        moved = [best for best in tried if best is not None]
         if moved:
-            motions = [motion for _, motion in moved]
-            found.append(
-                moved[choose_extent(motions, action.cameras, state, shown, hidden, config.color)]
-            )
-    if things and grip.sure and not found:
+            part = moving_part(moved[0][1], action.cameras, shown, hidden, config.color)
+            if config.min_points <= len(part.points_m) < config.part * len(growths[0].points_m):
+                best = _best_motion(part, grip, 1.0, action.cameras, shown, hidden, config)
+                moved += [best] if best else []
+            scene = action.cameras, state, shown, hidden, config.color
+            found.append(moved[choose_extent(moved, growths, *scene)])
+    if found:
+        return min(found, key=lambda candidate: candidate[0]), ""
+    if clusters and grip.sure:
         note = "closed on something without an id that the clip shows at rest"
-    return min(found, key=lambda candidate: candidate[0], default=None), note
+    return None, note
 
 
 def _best_motion(
@@ -209,19 +219,21 @@ def _best_motion(
     shown: Float32[np.ndarray, "f h w 3"],
     hidden: Bool[np.ndarray, "f h w"],
     config: TrackObjects,
-) -> _Candidate | None:
+) -> Candidate | None:
     """Return the best accepted motion of an object with one hand, after its change of cost.
 
     The change is relative to the object at rest, because an object in the table's color costs
     little anywhere. It is 0 if the object is not visible, and lower for an object in the grip.
     """
-    best: _Candidate | None = None
+    best: Candidate | None = None
     still = np.repeat(np.eye(4)[None], len(shown), axis=0)
     rest = _cost(model, still, cameras, shown, hidden, config)
     improvement = max(config.min_improvement, (1 - config.max_cost_ratio) * rest)
     for hold in grip.holds:
         gripped = grip.has(model.points_m, hold[0])
         max_change = config.grip_evidence if gripped else -improvement
+        if gripped and is_firm(model.points_m, grip.tips_m, hold):
+            max_change = config.firm_evidence
         loose = couplings(grip.palm_m, grip.rigid[hold[0]], model.plane[:3], hold)
         hinge = grip.hinges[hold]
         for path in (*loose, hinge):
@@ -296,23 +308,47 @@ def fall(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"], fps: int) -
     `others_m` are the other points of the state. An object does not fall if it was not lifted, if
     it is on a hinge, or if a hand holds it to the end.
     """
-    released, last = motion.released, len(motion.path) - 1
-    normal, offset = motion.model.plane[:3], motion.model.plane[3]
-    if motion.hinged or released == last or not np.isfinite(offset):
+    if not motion.lands:
         return motion
+    up, gap = _gap_below(motion, others_m)
     first = motion.model.points_m
-    side = 1.0 if first.mean(axis=0) @ normal + offset > 0 else -1.0
-    up, floor = side * normal, float(-side * offset)
-    end = transform(motion.path[released], first)
-    if ((end - first) @ up).mean() < MIN_LIFT_M:
+    if ((transform(motion.path[motion.released], first) - first) @ up).mean() < MIN_LIFT_M:
         return motion
-    # Not the clearance alone: only the visible side has points, so it is not 0 on the ground.
-    gap = _clearance(end, others_m, up, floor) - _clearance(first, others_m, up, floor)
-    seconds = np.maximum(np.arange(last + 1) - released, 0) / fps
+    seconds = np.maximum(np.arange(len(motion.path)) - motion.released, 0) / fps
     drop = np.minimum(GRAVITY / 2 * seconds**2, max(gap, 0.0))
     path = motion.path.copy()
     path[:, :3, 3] -= drop[:, None] * up
     return replace(motion, path=path)
+
+
+def snap(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"]) -> ObjectMotion:
+    """Return the motion with a released object at its first height above the surface below it.
+
+    The correction grows from the grasp to the release. Objects that do not `fall` are not snapped,
+    and none whose height differs by more than `SNAP_M`.
+    """
+    if not motion.lands:
+        return motion
+    up, gap = _gap_below(motion, others_m)
+    if abs(gap) > SNAP_M:
+        return motion
+    path = motion.path.copy()
+    path[:, :3, 3] -= motion.carried[:, None] * gap * up
+    return replace(motion, path=path)
+
+
+def _gap_below(
+    motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, " 3"], float]:
+    """Return the direction up, and how much higher above its support the object ends, in meters."""
+    normal, offset = motion.model.plane[:3], motion.model.plane[3]
+    first, end = motion.model.points_m, transform(motion.path[-1], motion.model.points_m)
+    side = 1.0 if first.mean(axis=0) @ normal + offset > 0 else -1.0
+    up, floor = side * normal, float(-side * offset)
+    # Not the clearance alone: only the visible side has points, so it is not 0 on the ground.
+    # Before the grasp, points above the object's lowest ones are next to it, or left of it.
+    under = others_m[others_m @ up < np.quantile(first @ up, 0.02) + FOOTPRINT_M]
+    return up, _clearance(end, others_m, up, floor) - _clearance(first, under, up, floor)
 
 
 def _clearance(

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw
 from egosim_jax.types import View
 
 TINT = 0.6
-"""Weight of an object's color beside the view's."""
+"""Weight of an object's color in a view."""
 GOLDEN = 0.618034
 """Step of the hue from one id to the next: few steps give hues that are far apart."""
 

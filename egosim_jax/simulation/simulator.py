@@ -60,7 +60,7 @@ class Step:
     state: SceneState
     """State after the step."""
     notes: tuple[str, ...] = ()
-    """What the perception says in words: new objects, and what it could not decide."""
+    """Words of the perception: new objects, and what it could not decide."""
 
 
 @dataclass(frozen=True, kw_only=True)

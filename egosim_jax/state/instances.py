@@ -11,11 +11,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
 from egosim_jax.geometry import pixel_rays
+from egosim_jax.state.depth import known_depth
 from egosim_jax.state.planes import SupportPlane, area_of, fit_plane, support_planes
 from egosim_jax.state.regions import RegionConfig, find_regions
 from egosim_jax.types import SceneState, check_counts
@@ -43,9 +45,12 @@ class ObjectSearch:
     max_extent_m: float = 0.6
     """Maximum extent of an object along each axis, in meters."""
     max_foot_m: float = 0.03
-    """Maximum height of an object's lowest part above what it stands on, in meters."""
+    """Maximum height of an object's lowest visible part above its surface, in meters.
+
+    Half of the object's height is allowed, too: a camera above a ball does not see its lower part.
+    """
     outline_m: float = 0.05
-    """Distance by which objects may stand out over the visible outline of a surface, in meters."""
+    """Maximum distance of an object from the visible outline of its surface, in meters."""
     min_points: int = 30
     """Minimum number of pixels of an object in the image as it is given."""
     regions: RegionConfig = field(default_factory=RegionConfig)
@@ -56,6 +61,7 @@ class ObjectSearch:
         check_counts({"max_width": self.max_width, "min_points": self.min_points})
 
 
+@no_type_check  # shapes and dtypes are checked with messages for users
 def find_objects(
     image: UInt8[np.ndarray, "h w 3"],
     depth_m: Float[np.ndarray, "h w"],
@@ -65,10 +71,12 @@ def find_objects(
     """Return the object id of each pixel, from 1 for the largest; 0 is the background.
 
     The image has no hands, and is taken from above the surfaces, by a camera that is not turned on
-    its side. Depth is in meters along the camera's z axis; 0, NaN and infinity mean unknown.
+    its side. Depth is in meters along the camera's z axis; 0, NaN and infinity mean unknown. Raises
+    `InputError` for arrays that `state_from_depth` refuses.
     """
     import cv2
 
+    known_depth(image, depth_m)
     search = search or ObjectSearch()
     every = max(1, -(-max(depth_m.shape) // search.max_width))
     coarse = np.asarray(depth_m[::every, ::every], float)
@@ -102,7 +110,7 @@ def _heights(
     tolerance = max(search.min_height_m, 0.008 * float(np.median(cloud[:, 2])))
     lowest = np.full(len(cloud), np.nan)
     noise = np.full(len(cloud), search.min_height_m)
-    surfaces = support_planes(cloud, UP, tolerance_m=tolerance)
+    surfaces = support_planes(cloud, UP, eye_m=np.zeros(3), tolerance_m=tolerance)
     for surface in _without_tops(surfaces, cloud, search):
         height, deviation, inside = _above(surface, cloud, tolerance, search)
         limit = max(search.min_height_m, 3 * deviation)
@@ -187,9 +195,7 @@ def _walls(
             break
         plane, inliers = fit_plane(cloud[rest], tolerance_m)
         upright = abs(plane[:3] @ surfaces[0].plane[:3]) < np.cos(np.radians(WALL_TILT_DEG))
-        if area_of(cloud[rest[inliers]], plane) < WALL_AREA_M2:
-            break
-        if upright:
+        if upright and area_of(cloud[rest[inliers]], plane) >= WALL_AREA_M2:
             found += rest[inliers].tolist()
         rest = np.delete(rest, inliers)
     return found
@@ -209,14 +215,15 @@ def _keep_objects(
     import cv2
 
     numbers, counts = np.unique(labels[labels > 0], return_counts=True)
-    fits = {}
+    fits, standing = {}, set()
     for number, count in zip(numbers.tolist(), counts.tolist(), strict=True):
         own = labels == number
         low, high = np.quantile(heights[own], [0.03, 0.97])
         extent = np.ptp(np.quantile(points[own], [0.02, 0.98], axis=0), axis=0).max()
         if count >= min_pixels and high >= search.min_top_m and extent <= search.max_extent_m:
             fits[number] = low
-    standing = {number for number, low in fits.items() if low <= search.max_foot_m}
+            if low <= max(search.max_foot_m, high / 2):
+                standing.add(number)
     for number in sorted(fits.keys() - standing, key=lambda n: fits[n]):
         own = labels == number
         around = cv2.dilate(own.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -238,7 +245,7 @@ def _grow_down(
 ) -> Int32[np.ndarray, "h w"]:
     """Return labels with the feet of objects, which are nearer to the surface than its noise.
 
-    A pixel beside an object belongs to it if its color is nearer to the object's beside it than to
+    A pixel next to an object belongs to it if its color is nearer to the object's there than to
     the surface's around it.
     """
     import cv2

@@ -17,6 +17,13 @@ def next_object_id(state: SceneState) -> int:
     return max(used) + 1
 
 
+def without_ids(state: SceneState) -> SceneState:
+    """Return the state with all points in the background, as a camera sees them."""
+    return replace(
+        state, object_ids=np.zeros_like(state.object_ids), names={}, world_from_object={}
+    )
+
+
 def with_objects(
     state: SceneState, new_objects: Mapping[int, Float32[np.ndarray, "n 3"]]
 ) -> SceneState:

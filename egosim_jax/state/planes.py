@@ -16,12 +16,13 @@ ITERATIONS = 500
 MAX_FITS = 12
 """Maximum number of fitted planes, walls included."""
 MAX_TILT_DEG = 75.0
-"""Maximum angle between the first support plane's normal and the given direction.
+"""Maximum angle between a camera's upward direction and the normal of a plane that it looks at.
 
-A camera that looks down at a table tilts by less, and the walls that it sees tilt by more.
+The normal points to the camera. A table below a camera that looks down tilts by less; a wall in
+front of it tilts by over 90 degrees.
 """
 PARALLEL_DEG = 10.0
-"""Maximum angle between the normals of two support planes."""
+"""Maximum angle between the normals of two support planes, or between one and the true vertical."""
 MIN_AREA_M2 = 0.02
 """Minimum visible area of every support plane after the first, in square meters."""
 MAX_SAMPLED = 60_000
@@ -63,28 +64,29 @@ def support_planes(
     points_m: Float[np.ndarray, "n 3"],
     up: Float[np.ndarray, " 3"],
     *,
+    eye_m: Float[np.ndarray, " 3"] | None = None,
     tolerance_m: float = 0.006,
     min_points: int = 30,
-    max_tilt_deg: float = MAX_TILT_DEG,
 ) -> list[SupportPlane]:
-    """Return the horizontal surfaces of a scene, the largest first.
+    """Return the horizontal surfaces of a scene, the largest first; the others are parallel to it.
 
-    `up` is a rough upward direction, such as -y of a camera. The first surface is within
-    `max_tilt_deg` of it, and the others are parallel to the first.
+    `up` is the vertical, or, with the position `eye_m` of a camera that looks down at the scene,
+    the camera's upward direction (-y), which may be far from the vertical.
     """
     points_m = np.asarray(points_m, float)
-    scale = np.linalg.norm(up)
     rest = np.arange(len(points_m))
     rest = rest[:: max(1, -(-len(rest) // MAX_SAMPLED))]
     found: list[SupportPlane] = []
-    upward, max_angle = up / scale, max_tilt_deg
+    upward = up / np.linalg.norm(up)
+    max_angle = PARALLEL_DEG if eye_m is None else MAX_TILT_DEG
     for _ in range(MAX_FITS):
         if len(rest) < max(min_points, 3):
             break
         plane, inliers = fit_plane(points_m[rest], tolerance_m)
         if len(inliers) < min_points:
             break
-        plane = plane if plane[:3] @ upward > 0 else -plane
+        side = plane[:3] @ upward if eye_m is None else plane[:3] @ eye_m + plane[3]
+        plane = plane if side > 0 else -plane
         on = rest[inliers]
         rest = np.delete(rest, inliers)
         angle = np.degrees(np.arccos(np.clip(plane[:3] @ upward, -1, 1)))

@@ -1,20 +1,22 @@
 """Regions of an RGB-D image that are one object each.
 
 Pixels are cut where the depth jumps, and then by color (Felzenszwalb and Huttenlocher, 2004).
-Neighboring regions are joined unless their common border is concave and their colors differ: a
-label continues the surface of its bottle, and a box beside another box does not. Separate pieces of
-one color are joined if they are close: a cup and its handle.
+Neighboring regions are joined by the sum of the evidence of their borders. A concave border between
+two colors is evidence of two objects; any other border is of one: a label continues the surface of
+its bottle. Separate pieces of one color are joined if they are close: a cup and its handle.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32
 
+WEAK = 0.25
+"""Evidence of a border that is smooth or has one color, but not both, relative to a sure one."""
 LIGHTNESS = 0.5
-"""Weight of a difference in lightness, which shading changes, beside one of hue."""
+"""Weight of a difference in lightness, which shading changes, relative to hue."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,21 +24,21 @@ class RegionConfig:
     """Thresholds of the division into regions."""
 
     color_scale: float = 60.0
-    """Preference for large regions (k of the algorithm), in units of CIELAB times pixels."""
+    """Preference for large regions (k of the algorithm), in CIELAB times pixels of 160 a row."""
     steepness: float = 4.0
     """Step of the depth that is a jump, in widths of a pixel's footprint."""
     min_jump_m: float = 0.006
     """Minimum step of the depth that is a jump, in meters."""
-    min_pixels: int = 12
-    """Number of pixels below which a region joins its most similar neighbor."""
+    min_pixels: float = 12.0
+    """Size below which a region joins its most similar neighbor, in pixels of 160 a row."""
     concavity: float = 0.25
     """Minimum sine of the bend of a concave border."""
     color_difference: float = 8.0
     """Minimum difference between the colors of two objects, in units of CIELAB."""
     gap_m: float = 0.012
-    """Maximum distance between two pieces of an object, in meters."""
+    """Maximum distance of a small piece from its object, in meters; half of it for a large one."""
     piece: float = 0.25
-    """Maximum size of a separate piece, as a fraction of the larger one's."""
+    """Maximum size of a small piece, as a fraction of its object's."""
 
 
 class _Sets:
@@ -72,10 +74,16 @@ def find_regions(
 ) -> Int32[np.ndarray, "h w"]:
     """Return the region of each candidate pixel, from 1; 0 elsewhere."""
     color = lab * np.array([LIGHTNESS, 1, 1], np.float32)
+    finer = (max(candidates.shape) / 160) ** 2
+    config = replace(
+        config,
+        color_scale=config.color_scale * finer,
+        min_pixels=config.min_pixels * finer,
+    )
     pairs = _neighbors(points[..., 2], candidates, footprint_m, config)
     parts = _by_color(color.reshape(-1, 3), candidates.ravel(), pairs, config)
     parts = _join_surfaces(parts, points, color, pairs, config)
-    parts = _join_pieces(parts, points.reshape(-1, 3), color.reshape(-1, 3), config)
+    parts = _join_pieces(parts, points, color, config)
     return _compact(parts).reshape(candidates.shape)
 
 
@@ -155,7 +163,7 @@ def _join_surfaces(
     pairs: Int[np.ndarray, "e 2"],
     config: RegionConfig,
 ) -> Int[np.ndarray, " n"]:
-    """Join neighboring parts unless their border is concave and their colors differ."""
+    """Join neighboring parts by the bend of their borders and the contrast of their colors."""
     height, width = points.shape[:2]
     reach = max(1, round(max(height, width) / 160))
     normals = _normals(points, parts.reshape(height, width), reach).reshape(-1, 3)
@@ -166,19 +174,52 @@ def _join_surfaces(
     one, other = _inward(border, parts, width, reach)
     apart = flat[one] - flat[other]
     apart /= np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-9)
-    convex = ((normals[one] - normals[other]) * apart).sum(axis=1)
+    convex = np.nan_to_num(((normals[one] - normals[other]) * apart).sum(axis=1))
     differ = np.linalg.norm(colors[one] - colors[other], axis=1)
     keys = np.sort(np.stack([parts[border[:, 0]], parts[border[:, 1]]], axis=1), axis=1)
     names, inverse = np.unique(keys, axis=0, return_inverse=True)
-    sets = _Sets(int(parts.max()) + 1)
+    weights = {}
     for number, (a, b) in enumerate(names.tolist()):
         here = inverse.ravel() == number
-        concave = float(np.nanmedian(convex[here])) < -config.concavity
-        if not (concave and float(np.median(differ[here])) > config.color_difference):
-            a, b = sets.find(a), sets.find(b)
-            if a != b:
-                sets.join(a, b)
-    return np.where(parts >= 0, sets.labels()[np.maximum(parts, 0)], -1)
+        bend, contrast = float(np.median(convex[here])), float(np.median(differ[here]))
+        weights[a, b] = int(here.sum()) * _score(bend, contrast, config)
+    joined = _contract(weights)
+    return np.array([joined.get(part, part) for part in parts.tolist()], int)
+
+
+def _score(bend: float, contrast: float, config: RegionConfig) -> float:
+    """Return the evidence of a border, per pixel, that both sides are one object."""
+    same = contrast <= config.color_difference
+    if bend < -config.concavity:
+        return WEAK if same else -1.0
+    return 1.0 if same or bend > config.concavity else WEAK
+
+
+def _contract(weights: dict[tuple[int, int], float]) -> dict[int, int]:
+    """Return the group of each part, by greedy additive edge contraction (Keuper et al., 2015).
+
+    The pair with the largest weight is joined, and the weights of its neighbors are added, until no
+    positive weight is left.
+    """
+    near: dict[int, dict[int, float]] = {}
+    for (one, other), weight in weights.items():
+        near.setdefault(one, {})[other] = weight
+        near.setdefault(other, {})[one] = weight
+    group = {part: part for part in near}
+    while near:
+        weight, one, other = max(
+            ((w, a, b) for a, row in near.items() for b, w in row.items() if a < b),
+            default=(0.0, 0, 0),
+        )
+        if weight <= 0:
+            break
+        for part, now in group.items():
+            group[part] = one if now == other else now
+        for third, more in near.pop(other).items():
+            near[third].pop(other)
+            if third != one:
+                near[one][third] = near[third][one] = near[one].get(third, 0.0) + more
+    return group
 
 
 def _inward(
@@ -230,28 +271,39 @@ def _normals(
 
 def _join_pieces(
     parts: Int[np.ndarray, " n"],
-    points: Float[np.ndarray, "n 3"],
-    color: Float32[np.ndarray, "n 3"],
+    points: Float[np.ndarray, "h w 3"],
+    color: Float32[np.ndarray, "h w 3"],
     config: RegionConfig,
 ) -> Int[np.ndarray, " n"]:
-    """Join separate small parts with a close larger part of the same color."""
+    """Join each separate part with the closest larger part of the same hue.
+
+    A sliver, such as the side of a box that is seen at a grazing angle, has no color of its own.
+    """
+    import cv2
     from scipy.spatial import KDTree
 
+    height, width = points.shape[:2]
+    kernel = np.ones((3, 3), np.uint8)
+    flat, hues = points.reshape(-1, 3), (color * np.array([0.4, 1, 1])).reshape(-1, 3)
     numbers, counts = np.unique(parts[parts >= 0], return_counts=True)
     order = numbers[np.argsort(-counts, kind="stable")].tolist()
     sizes = dict(zip(numbers.tolist(), counts.tolist(), strict=True))
     parts, kept = parts.copy(), []
     for number in order:
         own = np.flatnonzero(parts == number)
-        hue = np.median(color[own], axis=0)
-        best = (config.gap_m, -1)
+        hue = np.median(hues[own], axis=0)
+        mask = (parts == number).reshape(height, width).astype(np.uint8)
+        sliver = not cv2.erode(mask, kernel, borderValue=0).any()
+        best = (np.inf, -1)
         for other, tree, other_hue in kept:
-            similar = np.linalg.norm(hue - other_hue) <= config.color_difference
-            if similar and sizes[number] <= config.piece * sizes[other]:
-                gap = float(tree.query(points[own])[0].min())
-                best = min(best, (gap, other))
+            same = np.linalg.norm(hue - other_hue) <= config.color_difference
+            if same or sliver:
+                small = sliver or sizes[number] <= config.piece * sizes[other]
+                gap = float(tree.query(flat[own])[0].min())
+                if gap <= config.gap_m * (1.0 if small else 0.5):
+                    best = min(best, (gap, other))
         if best[1] >= 0:
             parts[own] = best[1]
         else:
-            kept.append((number, KDTree(points[own]), hue))
+            kept.append((number, KDTree(flat[own]), hue))
     return parts

@@ -13,6 +13,7 @@ from egosim_jax.perception.grasps import (
     find_holds,
     hinge_motion,
     is_between,
+    is_firm,
     palm_motion,
     seen_frames,
 )
@@ -142,3 +143,30 @@ def test_a_hand_rests_where_it_enters_and_leaves_and_is_interpolated_in_between(
     np.testing.assert_allclose(step, [0, 0, 0, 1, 2, 3, 3, 3], atol=1e-9)
     grip = Grip.of(joints, "human", tolerance_m=TOLERANCE_M, radius_m=0.01)
     assert grip.holds == [(2, 4), (2, 5), (3, 5)]
+
+
+@pytest.mark.parametrize(
+    ("low_cm", "high_cm", "travel_cm", "firm"),
+    [
+        ([0.2, -1, -1], [4.8, 1, 1], 10, True),
+        ([1, -1, -1], [4.5, 1, 1], 10, True),
+        ([0.2, -1, -1], [4.8, 1, 1], 1, False),
+        ([2, -1, -1], [8, 1, 1], 10, False),
+        ([0.2, 3, -1], [4.8, 5, 1], 10, False),
+        ([2, -0.2, -0.2], [2.5, 0.2, 0.2], 10, False),
+    ],
+    ids=[
+        "both sides touched",
+        "the far side is not observed",
+        "not carried away",
+        "a finger would be inside",
+        "closed beside it",
+        "much free space",
+    ],
+)
+def test_a_grip_is_firm_if_the_object_fills_it_and_leaves(low_cm, high_cm, travel_cm, firm):
+    corners = np.stack(np.meshgrid(*np.linspace(low_cm, high_cm, 5).T), axis=-1)
+    tips = np.zeros((6, 3, 3))
+    tips[:, 1:, 0] = 5
+    tips[:, :, 2] = np.linspace(0, travel_cm, 6)[:, None]
+    assert is_firm(corners.reshape(-1, 3) / 100, tips / 100, (0, 5)) == firm

@@ -7,13 +7,13 @@ import pytest
 
 from egosim_jax.geometry import look_at
 from egosim_jax.perception.grasps import Grip
-from egosim_jax.perception.growth import NEW, Growth, things_without_id
+from egosim_jax.perception.growth import NEW, Growth, clusters_without_id
 from egosim_jax.types import Cameras, SceneState
 
 RED, BLUE, WOOD = (200, 30, 30), (30, 40, 190), (150, 140, 120)
 STEP_M = 0.004
 CAMERA = Cameras(
-    world_from_camera=look_at(np.array([0, -0.5, 0.6]), np.zeros(3), up=np.array([0, 0, 1.0]))[
+    world_from_camera=look_at(np.array([-0.3, -0.5, 0.6]), np.zeros(3), up=np.array([0, 0, 1.0]))[
         None
     ],
     intrinsics_px=np.array([[277.0, 0, 159.5], [0, 277, 95.5], [0, 0, 1]]),
@@ -22,22 +22,22 @@ CAMERA = Cameras(
 )
 
 
-def box(low, high, color):
-    """Return the points of a box's top, front and left side, and its color."""
+def box(low, high, color, *, sides=3):
+    """Return the points of a box's top, front and left side, or of the first of them."""
     x, y, z = (np.arange(a, b + 1e-9, STEP_M) for a, b in zip(low, high, strict=True))
     faces = [
         np.stack(np.meshgrid(x, y, high[2:]), axis=-1),
         np.stack(np.meshgrid(x, low[1:2], z), axis=-1),
         np.stack(np.meshgrid(low[:1], y, z), axis=-1),
     ]
-    return np.concatenate([face.reshape(-1, 3) for face in faces]), color
+    return np.concatenate([face.reshape(-1, 3) for face in faces[:sides]]), color
 
 
-def scene(*things):
-    """Return a state without ids: things on a wooden table."""
+def scene(*clusters):
+    """Return a state without ids: clusters on a wooden table."""
     side = np.arange(-0.3, 0.3, STEP_M)
     table = np.stack(np.meshgrid(side, side, [0.0]), axis=-1).reshape(-1, 3)
-    pieces = [(table, WOOD), *things]
+    pieces = [(table, WOOD), *clusters]
     points = np.concatenate([points for points, _ in pieces]).astype(np.float32)
     return SceneState(
         points_m=points,
@@ -58,10 +58,10 @@ def closed_on(thumb, fingers):
 
 
 def grown(state, grip, config=None):
-    """Return the growths of the only thing in a grip, as numbers of points by color."""
-    things, note = things_without_id(grip, CAMERA, state, config or Growth())
+    """Return the growths of the only cluster in a grip, as numbers of points by color."""
+    clusters, note = clusters_without_id(grip, CAMERA, state, config or Growth())
     assert note == ""
-    (growths,) = things
+    (growths,) = clusters
     assert {model.number for model in growths} == {NEW}
     return [
         {color: int((model.colors == color).all(axis=1).sum()) for color in (RED, BLUE, WOOD)}
@@ -87,52 +87,54 @@ def test_the_lowest_points_of_an_object_are_its_own():
 @pytest.mark.parametrize(
     "other",
     [
-        box((0.02, -0.02, 0), (0.06, 0.02, 0.04), BLUE),
+        box((0.024, -0.02, 0), (0.06, 0.02, 0.04), BLUE, sides=2),
         box((-0.06, -0.06, 0), (0.06, -0.02, 0.02), BLUE),
     ],
     ids=["flush", "lower"],
 )
-def test_an_object_that_touches_another_has_a_growth_of_its_own(other):
+def test_an_object_that_touches_another_has_its_own_growth(other):
     growths = grown(scene(CUBE, other), GRIP)
     assert growths[0][BLUE] > 0
     assert any(g[BLUE] == 0 and g[RED] > 0.9 * len(CUBE[0]) for g in growths)
 
 
 def test_a_stacked_object_of_the_same_color_ends_at_the_concave_edge():
-    below = box((-0.06, -0.06, 0), (0.06, 0.06, 0.04), RED)
+    points, _ = box((-0.06, -0.06, 0), (0.06, 0.06, 0.04), RED)
+    hidden = (np.abs(points[:, :2]) < 0.02).all(axis=1)
+    below = points[~hidden], RED
     above = box((-0.02, -0.02, 0.04), (0.02, 0.02, 0.08), RED)
     grip = closed_on((-0.025, 0, 0.07), (0.025, 0, 0.07))
     sizes = [growth[RED] for growth in grown(scene(below, above), grip)]
     assert sizes[0] > 0.9 * len(below[0])
-    assert any(0.7 * len(above[0]) < size < 1.2 * len(above[0]) for size in sizes)
+    assert any(0.7 * len(above[0]) < size < 1.2 * len(above[0]) for size in sizes), sizes
 
 
 @pytest.mark.parametrize(
-    ("things", "note"),
+    ("clusters", "note"),
     [
         ([], "closed on nothing"),
         ([box((-0.28, -0.02, 0), (0.28, 0.02, 0.04), RED)], "larger than 0.35 m"),
     ],
     ids=["nothing", "too large"],
 )
-def test_why_nothing_is_grown_is_said(things, note):
-    state = scene(*things)
-    lifted = replace(GRIP, tips_m=GRIP.tips_m + [0, 0, 0.0 if things else 0.1])
-    found, said = things_without_id(lifted, CAMERA, state, Growth())
+def test_why_nothing_is_grown_is_said(clusters, note):
+    state = scene(*clusters)
+    lifted = replace(GRIP, tips_m=GRIP.tips_m + [0, 0, 0.0 if clusters else 0.1])
+    found, said = clusters_without_id(lifted, CAMERA, state, Growth())
     assert found == []
     assert note in said
 
 
-def test_a_sheet_that_looks_like_the_table_cannot_be_told_from_it():
+def test_a_sheet_that_looks_like_the_table_is_not_found():
     sheet = box((-0.05, -0.05, 0), (0.05, 0.05, 0.001), WOOD)
     low = replace(GRIP, tips_m=GRIP.tips_m - [0, 0, 0.028])
-    found, said = things_without_id(low, CAMERA, scene(sheet), Growth())
+    found, said = clusters_without_id(low, CAMERA, scene(sheet), Growth())
     assert found == []
-    assert said == "closed on something that cannot be told from its support"
+    assert said == "closed on something that looks like its support"
 
 
 def test_points_with_an_id_are_not_grown():
     state = scene(CUBE)
     red = (state.colors == RED).all(axis=1)
     known = replace(state, object_ids=red.astype(np.int32))
-    assert things_without_id(GRIP, CAMERA, known, Growth())[0] == []
+    assert clusters_without_id(GRIP, CAMERA, known, Growth())[0] == []

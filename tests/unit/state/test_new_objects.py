@@ -7,7 +7,7 @@ import pytest
 
 from egosim_jax.perception import archive
 from egosim_jax.state.fuse import fuse
-from egosim_jax.state.new_objects import is_among, next_object_id, with_objects
+from egosim_jax.state.new_objects import is_among, next_object_id, with_objects, without_ids
 from egosim_jax.state.snapshot import fingerprint
 from tests.unit.state.test_fuse import COARSE, HERE, THERE, at, start, tracked
 
@@ -20,7 +20,7 @@ def whole():
 @pytest.fixture(scope="module")
 def bare(whole):
     """The state of a plate on a table without the plate's id."""
-    return replace(whole, object_ids=np.zeros_like(whole.object_ids), names={})
+    return without_ids(whole)
 
 
 @pytest.fixture(scope="module")
