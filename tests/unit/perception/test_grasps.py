@@ -182,6 +182,8 @@ def test_a_grip_is_firm_if_both_sides_are_touched_and_it_leaves(low_cm, high_cm,
     tips[:, 1:, 0] = 0.05
     tips[:, :, 2] = np.linspace(0, travel_cm / 100, 6)[:, None]
     assert is_firm(faces, tips, (0, 5)) == firm
+
+
 def test_a_noisy_opening_is_no_evidence_of_a_hold():
     tips = np.zeros((60, 3, 3))
     tips[20:40, 1:, 0] = 0.04
