@@ -69,6 +69,8 @@ class Surroundings:
     low_colors: Float32[np.ndarray, "m 3"]
     plane: Float[np.ndarray, " 4"]
     """Plane a x + b y + c z + d = 0 with the normal up; d is NaN if there is no plane."""
+    noise_m: float
+    """Standard deviation of the plane's points from it, in meters."""
     eye_m: Float[np.ndarray, " 3"]
     """Place of the camera, which sees the outside of the surfaces."""
     config: Growth
@@ -97,6 +99,7 @@ class Surroundings:
             points_m=points[raised],
             colors=colors[raised],
             low_m=points[low],
+            noise_m=noise,
             low_colors=colors[low],
             plane=plane,
             eye_m=eye_m,
@@ -287,7 +290,9 @@ class Surroundings:
         feet = np.zeros(len(self.low_m), bool)
         if len(feet):
             gaps, nearest = KDTree(points).query(self.low_m, distance_upper_bound=2 * self.radius_m)
-            (close,) = np.nonzero(np.isfinite(gaps))
+            heights = self.low_m @ self.plane[:3] + self.plane[3]
+            above = heights > max(MIN_HEIGHT_M / 4, self.noise_m)  # a shadow is on the plane
+            (close,) = np.nonzero(np.isfinite(gaps) & above)
             ground = np.median(self.low_colors, axis=0)
             to_object = np.linalg.norm(self.low_colors[close] - colors[nearest[close]], axis=1)
             to_ground = np.linalg.norm(self.low_colors[close] - ground, axis=1)

@@ -115,7 +115,7 @@ class NewSurfaces:
             with np.errstate(invalid="ignore"):
                 continued = new & (np.abs(there - depth) <= self.tolerance_m)
                 flush = background & (np.abs(there - known_m) <= self.tolerance_m)
-            seam = dilate(continued, 0) & flush
+            seam = dilate(continued, 0.0) & flush
             depth[seam] = there[seam]
         return depth, ids
 
