@@ -33,7 +33,7 @@ MAX_ENDS = 24
 MAX_DEPTH_M = 0.06
 """Maximum distance of a grip behind the visible side of the gripped object, in meters."""
 FIT_M = 0.01
-"""Distance by which points may be off on either side of a gripped object, in meters."""
+"""Error of the width of a gripped object on either side, in meters."""
 MIN_ARC_DEG = 25.0
 """Minimum angle of an arc, in degrees; a shorter arc does not determine its axis."""
 MAX_ARC_ERROR = 0.05

@@ -247,7 +247,7 @@ class Surroundings:
         (rest,) = np.nonzero(~members)
         if not len(rest):
             return members
-        near = self._is_beside(rest, members)
+        near = self._is_next_to(rest, members)
         count, close = (np.bincount(parts[rest], weights) for weights in (None, near))
         piece = (close > 0) & ((count < self.config.min_points) | (close >= 0.9 * count))
         grown = members.copy()
@@ -264,8 +264,8 @@ class Surroundings:
         from scipy.spatial import KDTree
 
         (outside,) = np.nonzero(whole & ~members)
-        beside = self._is_beside(outside, members)
-        seam, rest = outside[beside], outside[~beside]
+        close = self._is_next_to(outside, members)
+        seam, rest = outside[close], outside[~close]
         if not len(seam) or len(rest) < SEAM_COLORS:
             return members
 
@@ -304,7 +304,7 @@ class Surroundings:
             plane=self.plane,
         )
 
-    def _is_beside(
+    def _is_next_to(
         self, others: Int[np.ndarray, " k"], members: Bool[np.ndarray, " n"]
     ) -> Bool[np.ndarray, " k"]:
         """Return which other points are next to an object, as the camera sees them."""

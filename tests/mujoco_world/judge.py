@@ -68,7 +68,7 @@ def state_of(film: Film, ids: Ids) -> SceneState:
 
 
 def judge(film: Film, perception: Perception, ids: Ids) -> Verdict:
-    """Perceive the film as if it were generated, and compare the fused state with the simulation."""
+    """Perceive the film as if it were generated, and compare the fused state with MuJoCo."""
     state, known = state_of(film, ids), state_of(film, "true")
     starts, owners = known.points_m, known.object_ids
     places = starts.astype(float)
