@@ -90,7 +90,7 @@ def refine_scale(record: Record, estimators: Estimators, config: AnnotateConfig)
     """
     from egosim_jax.perception.scale import contact_scale, scale_cameras
 
-    record = replace(record, depth=stand_out(record))
+    record = replace(record, depth=plane_behind_objects(record))
     contacts, joints_m = record.require("contacts"), record.joints_m
     if record.notes["scale"]["source"] != "hands" or joints_m is None or not len(contacts):
         return record
@@ -110,7 +110,7 @@ def refine_scale(record: Record, estimators: Estimators, config: AnnotateConfig)
     return replace(record, joints_m=joints_in_world(record))
 
 
-def stand_out(record: Record) -> DepthEstimate:
+def plane_behind_objects(record: Record) -> DepthEstimate:
     """Return the depth with an assumed plane moved behind the moved objects, by their width."""
     depth, own = record.require("depth"), record.moved[0]
     if depth.confident.any() or not own.any():

@@ -15,7 +15,7 @@ from egosim_jax.annotate.scene import (
     clean_first_frame,
     find_moved_objects,
     join_objects,
-    stand_out,
+    plane_behind_objects,
     to_triplet,
 )
 from egosim_jax.annotate.sources import Source, open_source
@@ -112,10 +112,10 @@ def test_moved_objects_get_ids_and_sleeves_are_arms(tmp_path, monkeypatch):
     assert record.require("moved_ids").tolist() == [5, 6]
     assert (record.moved == np.isin(ids, [5, 6])).all()
     plane = replace(record.require("depth"), confident=np.zeros((1, 48, 80), bool))
-    depth_m = stand_out(replace(record, depth=plane)).depth_m[0]
+    depth_m = plane_behind_objects(replace(record, depth=plane)).depth_m[0]
     assert (depth_m[record.moved[0]] == plane.depth_m[0, 0, 0]).all()
     assert np.unique(depth_m[~record.moved[0]]) == pytest.approx(plane.depth_m[0, 0, 0] * 1.24)
-    assert stand_out(record) is record.depth  # measured
+    assert plane_behind_objects(record) is record.depth  # measured
     record = clean_first_frame(record, settings.build(), settings)
     assert (record.require("first_frame")[35, 35] == record.frames[0, 35, 35]).all()
 
