@@ -108,7 +108,7 @@ class ObjectMotion:
 
     @property
     def lands(self) -> bool:
-        """Whether the object is put down on a known surface before the clip ends."""
+        """True if the object is put down on a known surface before the clip ends."""
         released = self.released < len(self.path) - 1
         return released and not self.hinged and bool(np.isfinite(self.model.plane[3]))
 

@@ -133,7 +133,7 @@ def turn(axis, point, angle):
         "soft fingertips",
         "not carried away",
         "a finger would be inside",
-        "closed beside it",
+        "closed next to it",
         "not closed on it",
     ],
 )
