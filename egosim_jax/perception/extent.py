@@ -163,7 +163,7 @@ def predicted_costs(
         drawn = np.append(colors, behind[None], axis=0)[rest]
         nearer = (moved >= 0) & (moved_m < rest_m)
         drawn = np.where(nearer[..., None], motion.model.colors[moved], drawn)
-        unknown = np.isnan(drawn).any(axis=-1)
+        unknown = np.asarray(np.isnan(drawn).any(axis=-1))
         compared &= ~np.stack([cv2.dilate(f.astype(np.uint8), SQUARE) > 0 for f in unknown])
         predicted.append(_closest(np.nan_to_num(drawn), shown))
     if compared.sum() <= MIN_KNOWN * covered.sum():

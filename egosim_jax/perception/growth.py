@@ -294,7 +294,9 @@ class Surroundings:
             above = heights > max(MIN_HEIGHT_M / 4, self.noise_m)  # a shadow is on the plane
             (close,) = np.nonzero(np.isfinite(gaps) & above)
             ground = np.median(self.low_colors, axis=0)
-            to_object = np.linalg.norm(self.low_colors[close] - colors[nearest[close]], axis=1)
+            to_object = np.linalg.norm(
+                self.low_colors[close] - colors[np.asarray(nearest)[close]], axis=1
+            )
             to_ground = np.linalg.norm(self.low_colors[close] - ground, axis=1)
             feet[close] = to_object < to_ground
         return ObjectModel(

@@ -104,7 +104,9 @@ def find_moved(
         first = segment_moved(frames, hidden, start, motion, cameras, depth_m)
         shown = np.stack([warp(first, matrix) for matrix in motion])
         column, row = np.rint(tracks.start).astype(int).T
-        held &= ~grown(shown.any(axis=0), 3)[row, column]  # an object that passes drags corners
+        held &= ~grown(np.asarray(shown.any(axis=0)), 3)[
+            row, column
+        ]  # an object that passes drags corners
         if first.sum() >= MIN_CORNERS**2:
             worn = _touches_border(first) and bool((first & grown(hidden[0], 5)).any())
             contacts = _contacts(start, motion, hands, width)

@@ -1,10 +1,10 @@
 """Surfaces that a clip shows for the first time, found without networks.
 
-A pixel that no point of the state explains may continue a plane of the background: the table next to
-its observed part, the table under an object that moved away, or the floor. It does if its ray meets
-the plane near observed points of the plane, and its color is one of theirs. A table ends at its
-edge, and the frames show where: beyond it the colors are other ones. Everything else stays
-unknown.
+A pixel that no point of the state explains may continue a plane of the background: the table next
+to its observed part, the table under an object that moved away, or the floor. It does if its ray
+meets the plane near observed points of the plane, and its color is one of theirs. A table ends at
+its edge, and the frames show where: beyond it the colors are other ones. Other sides of a moved
+object are inside its convex hull. Everything else stays unknown.
 """
 
 from __future__ import annotations
@@ -261,7 +261,8 @@ class _Pixels:
         depth, met = surface.meet(self.eye[some], self.toward[some], self.frame[some])
         ahead = depth < config.max_depth_m
         some, depth, met = some[ahead], depth[ahead], met[ahead]
-        gaps, near = KDTree(surface.points_m).query(met, k=config.compared_points)
+        found = KDTree(surface.points_m).query(met, k=config.compared_points)
+        gaps, near = (np.asarray(x) for x in found)
         reach = config.side_reach_m if isinstance(surface, _Hull) else config.reach * depth
         close = gaps[:, 0] <= reach
         some, depth, near = some[close], depth[close], near[close]

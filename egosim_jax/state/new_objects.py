@@ -43,5 +43,5 @@ def is_among(
 ) -> Bool[np.ndarray, " n"]:
     """Return which points have exactly the coordinates of one of the others."""
     exact = np.dtype((np.void, points_m.dtype.itemsize * 3))
-    rows = (np.ascontiguousarray(x).view(exact)[:, 0] for x in (points_m, others_m))
-    return np.isin(*rows)
+    points, others = (np.ascontiguousarray(x).view(exact)[:, 0] for x in (points_m, others_m))
+    return np.isin(points, others)

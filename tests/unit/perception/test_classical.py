@@ -32,8 +32,8 @@ def found(clip):
 
 
 def seen_before(clip):
-    """Return the pixels that the state's view shows; a seam around them may be set again."""
-    known = (render(clip.state, clip.cameras, point_px=1).mask == 0).astype(np.uint8)
+    """Return the pixels that see a point of the state; a seam around them may be set again."""
+    known = np.isfinite(render(clip.state, clip.cameras, point_px=1).depth_m).astype(np.uint8)
     return np.stack([cv2.erode(frame, np.ones((5, 5), np.uint8)) for frame in known]) > 0
 
 

@@ -22,11 +22,11 @@ RAYS = pixel_rays(CAMERAS.intrinsics_px, height=HEIGHT, width=WIDTH) @ POSE[:3, 
 TABLE_M = -POSE[2, 3] / RAYS[..., 2]
 """Depth of the table in each pixel."""
 RIGHT_M = POSE[0, 3] + TABLE_M * RAYS[..., 0]
-"""Distance to the right at which each pixel's ray meets the table."""
+"""Coordinate x of the point of the table that each pixel sees."""
 
 
 def perceive(colors, *, ids=None, motions=(), supports=()):
-    """Return the surfaces that the stage adds to a table with only its left half in the state."""
+    """Return the stage's result for a state with the left half of a table."""
     x, y = (v.ravel() for v in np.meshgrid(np.arange(-0.5, 0, 0.004), np.arange(-0.4, 0.6, 0.004)))
     count = len(x)
     state = SceneState(
@@ -52,8 +52,8 @@ def perceive(colors, *, ids=None, motions=(), supports=()):
 def test_the_table_continues_up_to_its_edge():
     colors = np.where((RIGHT_M < 0.06)[..., None], OAK, STONE)
     depth = perceive(colors).depth_m[0]
-    next_to = (RIGHT_M > 0.005) & (RIGHT_M < 0.055)
-    np.testing.assert_allclose(depth[next_to], TABLE_M[next_to], atol=0.002)
+    near = (RIGHT_M > 0.005) & (RIGHT_M < 0.055)
+    np.testing.assert_allclose(depth[near], TABLE_M[near], atol=0.002)
     assert not np.isfinite(depth[RIGHT_M > 0.06]).any()
     assert not np.isfinite(depth[RIGHT_M < -0.03]).any()
 
