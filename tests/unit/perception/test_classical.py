@@ -117,16 +117,31 @@ def test_the_silhouettes_cover_the_hands(clip):
     assert covered.mean() < 3 * hands.mean()
 
 
-def test_a_clip_without_motion_changes_nothing(clip):
+def without_motion(clip):
+    """Return a clip of the state at rest, and its action, from a camera that does not move."""
     still = np.repeat(clip.first.colors[None], SPEC.frames, axis=0)
-    cameras = clip.cameras
-    action = to_action(clip)
-    poses = np.repeat(cameras.world_from_camera[:1], SPEC.frames, axis=0)
-    action = replace(action, cameras=replace(cameras, world_from_camera=poses))
-    found = ClassicalConfig().build()(Clip(frames=still, fps=8), action, clip.state)
+    poses = np.repeat(clip.cameras.world_from_camera[:1], SPEC.frames, axis=0)
+    cameras = replace(clip.cameras, world_from_camera=poses)
+    return Clip(frames=still, fps=8), replace(to_action(clip), cameras=cameras)
+
+
+def test_a_clip_without_motion_changes_nothing(clip):
+    """The hand moves 15 cm above its path, where it holds nothing."""
+    still, action = without_motion(clip)
+    above = replace(action, joints_m=action.joints_m + np.float32([0, 0, 0.15]))
+    found = ClassicalConfig().build()(still, above, clip.state)
     assert not found.world_from_object
     after = fuse(clip.state, found)
     assert len(after.points_m) == len(clip.state.points_m)
+
+
+def test_a_clip_that_leaves_an_object_at_rest_does_not_overrule_a_firm_grip(clip):
+    found = ClassicalConfig().build()(*without_motion(clip), clip.state)
+    target = clip.body_ids[clip.target]
+    assert set(found.world_from_object) == {target}
+    last, true = found.world_from_object[target][-1], clip.world_from_body[clip.target]
+    gap = (last - true[-1] @ invert(true[0])) @ true[0][:, 3]
+    assert np.linalg.norm(gap) < 0.02
 
 
 def test_without_hands_nothing_is_found(clip):
