@@ -31,7 +31,7 @@ class MakeEpisode:
     where a hand is missing. Intrinsics are in pixels of the clips: scale them with the video. A
     .json file may also have a prompt. Give the scene by --state, or by --image (without hands) and
     --depth, both seen from the first camera. An image of another shape than the clips is cropped.
-    Only objects can move: --objects finds them in the image, and their names and sizes are printed.
+    Objects can move: --objects finds them in the image, and their names and sizes are printed.
     """
 
     out: Path
@@ -241,7 +241,7 @@ class FromLeRobot:
 class CheckEpisode:
     """Validate an episode: files, joints, units, cameras, frame of reference.
 
-    Prints a summary, or the first problem and its fix. Warns of a scene in which nothing can move.
+    Prints a summary, or the first problem and its fix. Warns of a scene without objects.
     """
 
     path: Annotated[Path, tyro.conf.Positional]
@@ -314,7 +314,7 @@ class ShowEpisode:
         view = rendering.get(self.renderer).render(state, cameras, point_px=rendering.POINT_PX)
         numbers = sorted(set(state.object_ids[state.object_ids > 0].tolist()))
         listed = ", ".join(state.names.get(n, f"object {n}") for n in numbers)
-        title = f"objects: {listed or 'none, nothing can move'}"
+        title = f"objects: {listed or 'none'}"
         return SheetClip(title, [draw_objects(view, state.names)])
 
     def _overlay(self, state: SceneState, action: Action) -> np.ndarray:

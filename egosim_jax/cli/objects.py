@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from egosim_jax.types import SceneState
 
 NOTHING_MOVES = (
-    "no point has an object id, so nothing can move. Make the episode with --objects auto or with "
+    "no point has an object id, so only what a hand closes on can move, if the perception is "
+    "classical. Make the episode with --objects auto or with "
     "a mask, or give object_ids to state_from_depth."
 )
 """Warning of a scene without objects, after its name."""
@@ -97,7 +98,7 @@ def names_of(ids: np.ndarray | None, known: Mapping[int, str], given: Sequence[s
 
 
 def describe_objects(state: SceneState) -> str:
-    """Return a line with the name and size of each object, or that nothing can move."""
+    """Return a line with the name and size of each object, or that there are none."""
     from egosim_jax.runtime.terminal import printable
     from egosim_jax.state.instances import object_sizes
 

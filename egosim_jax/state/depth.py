@@ -40,7 +40,7 @@ def state_from_depth(
 
     Depth is in meters along the camera's z axis; 0, NaN and infinity mean unknown. Pixel centers
     are at integer coordinates. `object_ids` has the object of each pixel, 0 for the background
-    (`find_objects` finds them), and `names` their names; without it nothing can move. Each pixel
+    (`find_objects` finds them), and `names` their names; without it nothing has an id. Each pixel
     gives `points_per_pixel` squared points, interpolated: a camera that moves nearer by this factor
     sees no gaps. Pixels between two surfaces (`between_surfaces`) give none. Raises `InputError` if
     shapes or dtypes differ, if no depth is known, or if the depth does not look like meters.

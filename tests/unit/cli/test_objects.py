@@ -63,10 +63,10 @@ def test_objects_are_found_named_and_printed(files, tmp_path, capsys):
     assert " cm" in printed
 
 
-def test_without_objects_make_and_check_say_that_nothing_can_move(files, tmp_path, capsys):
+def test_make_and_check_warn_of_a_scene_without_objects(files, tmp_path, capsys):
     state = make(files, tmp_path / "out", objects="none")
     assert not state.object_ids.any()
-    assert "nothing can move" in capsys.readouterr().out
+    assert "only what a hand closes on can move" in capsys.readouterr().out
     assert CheckEpisode(path=tmp_path / "out").run() == 0
     printed = capsys.readouterr().err
     assert printed.startswith("warning: ")
