@@ -252,7 +252,7 @@ class CheckEpisode:
     def run(self) -> int:
         """Load the episode, which checks every file."""
         from egosim_jax import configs
-        from egosim_jax.cli.objects import NOTHING_MOVES
+        from egosim_jax.cli.objects import NO_OBJECTS
         from egosim_jax.cli.simulate import check_fits
         from egosim_jax.runtime.terminal import printable
         from egosim_jax.simulation.episode import Episode
@@ -262,7 +262,7 @@ class CheckEpisode:
             check_fits(episode, configs.get(self.config).video, self.config)
         print(f"{self.path}: {summary(episode)}")
         if not (episode.state.object_ids > 0).any():
-            print(printable(f"warning: {self.path}: {NOTHING_MOVES}"), file=sys.stderr)
+            print(printable(f"warning: {self.path}: {NO_OBJECTS}"), file=sys.stderr)
         return ExitCode.DONE
 
 

@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
     from egosim_jax.types import SceneState
 
-NOTHING_MOVES = (
+NO_OBJECTS = (
     "no point has an object id, so only what a hand closes on can move, if the perception is "
-    "classical. Make the episode with --objects auto or with "
-    "a mask, or give object_ids to state_from_depth."
+    "classical. Make the episode with --objects auto or with a mask, or give "
+    "object_ids to state_from_depth."
 )
 """Warning of a scene without objects, after its name."""
 
@@ -98,13 +98,13 @@ def names_of(ids: np.ndarray | None, known: Mapping[int, str], given: Sequence[s
 
 
 def describe_objects(state: SceneState) -> str:
-    """Return a line with the name and size of each object, or that there are none."""
+    """Return a line with the name and size of each object, or `NO_OBJECTS`."""
     from egosim_jax.runtime.terminal import printable
     from egosim_jax.state.instances import object_sizes
 
     sizes = object_sizes(state)
     if not sizes:
-        return f"no objects: {NOTHING_MOVES}"
+        return f"no objects: {NO_OBJECTS}"
     listed = [
         f"{state.names.get(number, f'object {number}')}, "
         + " x ".join(f"{max(1, round(100 * side))}" for side in size)
