@@ -12,6 +12,7 @@ import tempfile
 import traceback
 import warnings
 from collections.abc import Iterator
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -138,8 +139,11 @@ def _peak_reset() -> int:
 
 def _children() -> list[str]:
     """The processes that this one started and that run, such as readers of HDF5."""
-    found = [p.read_text("ascii").split() for p in Path("/proc/self/task").glob("*/children")]
-    return [pid for pids in found for pid in pids if _status("VmRSS", pid)]
+    found = []
+    for path in Path("/proc/self/task").glob("*/children"):
+        with suppress(FileNotFoundError):  # the thread has ended
+            found += path.read_text("ascii").split()
+    return [pid for pid in found if _status("VmRSS", pid)]
 
 
 def _status(name: str, process: str = "self") -> int:

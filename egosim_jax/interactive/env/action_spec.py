@@ -65,7 +65,7 @@ class ActionSpec:
     camera: bool = False
     """Append the camera pose to each row; without it the camera does not move."""
     workspace_m: tuple[tuple[float, float, float], tuple[float, float, float]] = (
-        (-0.35, -0.15, 0.0),
+        (-0.35, -0.03, 0.0),
         (0.35, 0.55, 0.40),
     )
     """Minimum and maximum position of a wrist or joint in the world, in meters."""

@@ -35,7 +35,8 @@ def validity(state: SceneState, step: Step, action: Action, renderer: Renderer) 
     """Return the share of pixels that agree with the state, from 0 to 1, of two kinds.
 
     `validity` is of the background. `object_validity` is of the object that agrees least, of those
-    that no hand touches; `state` is the state before the step. Each is NaN without such pixels.
+    that no hand touches; `state` is the state before the step. Without such pixels, a figure is
+    left out.
     """
     view, frames = step.view, step.clip.frames
     skeletons = renderer.draw_hands(action.joints_m, action.cameras, kind=action.kind)[1]
@@ -48,10 +49,8 @@ def validity(state: SceneState, step: Step, action: Action, renderer: Renderer) 
         pixels = seen & _without_outline(view.object_ids == number)
         if np.count_nonzero(pixels) >= MIN_OBJECT_PIXELS:
             shares.append(float(agree[pixels].mean()))
-    return {
-        "validity": float(steady.mean()) if steady.size else float("nan"),
-        "object_validity": min(shares, default=float("nan")),
-    }
+    found = {"validity": float(steady.mean())} if steady.size else {}
+    return found | ({"object_validity": min(shares)} if shares else {})
 
 
 def steady_pixels(view: View, hands: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
