@@ -35,8 +35,8 @@ def validity(state: SceneState, step: Step, action: Action, renderer: Renderer) 
     """Return the share of pixels that agree with the state, from 0 to 1, of two kinds.
 
     `validity` is of the background. `object_validity` is of the object that agrees least, of those
-    that no hand touches; `state` is the state before the step. Without such pixels, a figure is
-    left out.
+    that no hand touches; `state` is the state before the step. Without such pixels, a figure
+    is absent.
     """
     view, frames = step.view, step.clip.frames
     skeletons = renderer.draw_hands(action.joints_m, action.cameras, kind=action.kind)[1]
