@@ -122,10 +122,7 @@ def _residuals(
     frame = np.broadcast_to(np.arange(len(local_m))[:, None], row.shape)
     row, column = np.where(inside, row, 0), np.where(inside, column, 0)
     there = shown[frame, row, column]
-    strength = np.maximum((model.colors**2).sum(axis=1), 1)
-    light = (there * model.colors).sum(axis=2) / strength
-    light = np.clip(light, color.min_light, color.max_light)
-    gaps = np.sqrt(np.square(there - light[..., None] * model.colors).mean(axis=2))
+    gaps = color.apart(there, model.colors)
     return np.where(inside & ~hidden[frame, row, column], gaps, np.nan)
 
 

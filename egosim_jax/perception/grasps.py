@@ -157,11 +157,21 @@ def is_between(
     points_m: Float[np.ndarray, "n 3"], tips_m: Float[np.ndarray, "j 3"], radius_m: float
 ) -> bool:
     """Return True if some point is between the thumb and the fingers, within a radius in meters."""
+    share, away = from_grip(points_m, tips_m)
+    return bool(((share > 0) & (share < 1) & (away <= radius_m)).any())
+
+
+def from_grip(
+    points_m: Float[np.ndarray, "n 3"], tips_m: Float[np.ndarray, "j 3"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return points' places between thumb (0) and fingers (1), and distances from there in meters.
+
+    Places outside of the grip are clipped to its ends.
+    """
     thumb, fingers = tips_m[0], tips_m[1:].mean(axis=0)
     across = fingers - thumb
-    share = (points_m - thumb) @ across / max(across @ across, 1e-12)
-    away = np.linalg.norm(points_m - thumb - share[:, None] * across, axis=1)
-    return bool(((share > 0) & (share < 1) & (away <= radius_m)).any())
+    share = np.clip((points_m - thumb) @ across / max(across @ across, 1e-12), 0, 1)
+    return share, np.linalg.norm(points_m - thumb - share[:, None] * across, axis=1)
 
 
 def is_behind(

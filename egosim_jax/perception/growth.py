@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from egosim_jax.geometry import UP_AXES, up_of
-from egosim_jax.perception.grasps import Grip
+from egosim_jax.perception.grasps import Grip, from_grip
 from egosim_jax.perception.pose_refinement import ObjectModel
 from egosim_jax.state.planes import support_planes
 from egosim_jax.types import Cameras, SceneState
@@ -376,10 +376,7 @@ def seeds_between(
 
     Points within 5 mm more than the nearest one's distance count; none beyond `reach_m`.
     """
-    thumb, fingers = tips_m[0], tips_m[1:].mean(axis=0)
-    across = fingers - thumb
-    share = np.clip((points_m - thumb) @ across / max(across @ across, 1e-12), 0, 1)
-    away = np.linalg.norm(points_m - thumb - share[:, None] * across, axis=1)
+    share, away = from_grip(points_m, tips_m)
     nearest = float(away.min(initial=np.inf))
     if nearest > reach_m:
         return np.zeros(0, int)

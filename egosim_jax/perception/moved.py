@@ -104,9 +104,8 @@ def find_moved(
         first = segment_moved(frames, hidden, start, motion, cameras, depth_m)
         shown = np.stack([warp(first, matrix) for matrix in motion])
         column, row = np.rint(tracks.start).astype(int).T
-        held &= ~grown(np.asarray(shown.any(axis=0)), 3)[
-            row, column
-        ]  # an object that passes drags corners
+        passed = grown(np.asarray(shown.any(axis=0)), 3)  # an object that passes drags corners
+        held &= ~passed[row, column]
         if first.sum() >= MIN_CORNERS**2:
             worn = _touches_border(first) and bool((first & grown(hidden[0], 5)).any())
             contacts = _contacts(start, motion, hands, width)

@@ -125,35 +125,33 @@ def _by_color(
     """Return the part of every pixel by color, -1 where there is no candidate."""
     weights = np.linalg.norm(color[pairs[:, 0]] - color[pairs[:, 1]], axis=1)
     order = np.argsort(weights, kind="stable")
+    alike_first = pairs[order].tolist()
     sets, size = _Sets(len(color)), [1] * len(color)
     limit = [config.color_scale] * len(color)
-    edges = zip(pairs[order].tolist(), weights[order].tolist(), strict=True)
-    for (one, other), weight in edges:
+    for (one, other), weight in zip(alike_first, weights[order].tolist(), strict=True):
         a, b = sets.find(one), sets.find(other)
         if a != b and weight <= min(limit[a], limit[b]):
             sets.join(a, b)
             size[a] += size[b]
             limit[a] = weight + config.color_scale / size[a]
-    _absorb_small(sets, size, color, pairs, config)
+    _absorb_small(sets, size, alike_first, config.min_pixels)
     return np.where(candidates, sets.labels(), -1)
 
 
 def _absorb_small(
     sets: _Sets,
     size: list[int],
-    color: Float32[np.ndarray, "n 3"],
-    pairs: Int[np.ndarray, "e 2"],
-    config: RegionConfig,
+    alike_first: list[list[int]],
+    min_pixels: float,
 ) -> None:
     """Join each small set with its neighbor of the most similar pixels.
 
-    Pixels at a border of two colors mix both, and would connect two objects.
+    `alike_first` are the pairs of neighboring pixels, by the difference of their colors. Pixels at
+    a border of two colors mix both, and would connect two objects.
     """
-    weights = np.linalg.norm(color[pairs[:, 0]] - color[pairs[:, 1]], axis=1)
-    order = np.argsort(weights, kind="stable")
-    for one, other in pairs[order].tolist():
+    for one, other in alike_first:
         a, b = sets.find(one), sets.find(other)
-        if a != b and min(size[a], size[b]) < config.min_pixels:
+        if a != b and min(size[a], size[b]) < min_pixels:
             sets.join(a, b)
             size[a] += size[b]
 
