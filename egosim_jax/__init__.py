@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from egosim_jax.simulation.rollout import Rollout
     from egosim_jax.simulation.simulator import Simulator, Step
     from egosim_jax.state.depth import state_from_depth
+    from egosim_jax.state.instances import find_objects
     from egosim_jax.state.snapshot import load as load_state
     from egosim_jax.state.snapshot import save as save_state
     from egosim_jax.types import (
@@ -63,6 +64,7 @@ __all__ = [
     "Triplet",
     "VideoSpec",
     "View",
+    "find_objects",
     "get_config",
     "get_perception",
     "load_state",
@@ -80,6 +82,7 @@ _HOMES = {
     "Episode": ("simulation.episode", "Episode"),
     "Generator": ("generation.generator", "Generator"),
     "Rollout": ("simulation.rollout", "Rollout"),
+    "find_objects": ("state.instances", "find_objects"),
     "get_config": ("configs", "get"),
     "get_perception": ("perception.registry", "get"),
     "load_state": ("state.snapshot", "load"),

@@ -8,12 +8,22 @@ coordinates. A matrix `a_from_b` takes coordinates in b to coordinates in a, so 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from egosim_jax.types import Cameras, InputError
+from egosim_jax.types import Cameras, InputError, SceneState
+
+Up = Literal["z", "-y"]
+"""Axis of the world that points up: z in the tabletop world, -y in EgoSim's first camera."""
+UP_AXES: dict[Up, tuple[float, float, float]] = {"z": (0.0, 0.0, 1.0), "-y": (0.0, -1.0, 0.0)}
+"""Unit vector of each axis that may point up."""
+
+
+def up_of(state: SceneState) -> Up:
+    """Return the axis that points up in a state's world, by its provenance."""
+    return "z" if state.provenance.get("world") == "tabletop" else "-y"
 
 
 def transform(a_from_b: Float[Any, "*#b 4 4"], points: Float[Any, "*#b n 3"]) -> Any:

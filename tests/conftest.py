@@ -1,7 +1,9 @@
 """Programs compile quickly; workers, what they start and the next run share them."""
 
+import gc
 import os
 import re
+from collections.abc import Generator
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -12,7 +14,9 @@ from tests.flags import QUICK
 os.environ.setdefault("XLA_FLAGS", QUICK)
 CACHE = Path(__file__).parents[1] / ".pytest_cache"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE / "compiled"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ["XDG_CACHE_HOME"] = str(CACHE / "home")
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # the workers use all cores; more threads spin
 
 NEEDS_TORCH = re.compile(r"^(?:import|from) torch\b", re.MULTILINE)
 
@@ -24,6 +28,29 @@ def pytest_ignore_collect(collection_path: Path) -> bool | None:
     return None
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Exempt imported modules from searches for garbage."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(
+    item: pytest.Item, nextitem: pytest.Item | None
+) -> Generator[None, object, object]:
+    """Exempt what a finished module keeps, such as jax's traces: a search took 7 seconds."""
+    done = yield
+    if nextitem is None or nextitem.path != item.path:
+        gc.collect()
+        gc.freeze()
+    return done
+
+
 @pytest.fixture(scope="session")
 def debug_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Random weights of `debug`, which no test changes."""
@@ -31,3 +58,9 @@ def debug_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from egosim_jax.testing import write_weights
 
     return write_weights(tmp_path_factory.mktemp("debug"), configs.get("debug"))
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw no curves on the page of a training: they take most of a short one."""
+    monkeypatch.setattr("egosim_jax.train.run_page.draw_curves", lambda plots: b"<svg/>")

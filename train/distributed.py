@@ -20,12 +20,14 @@ import socket
 import sys
 import threading
 import warnings
-from collections.abc import Iterator
+import zlib
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from jax.experimental import multihost_utils
 from orbax.checkpoint import multihost
 
@@ -134,6 +136,19 @@ def wait_for_all(name: str) -> None:
     if jax.process_count() > 1:
         everyone = set(range(jax.process_count()))
         multihost.sync_global_processes(name, processes=everyone, timeout=FETCH_S)
+
+
+def count_distinct(names: Iterable[str], maximum: int) -> int:
+    """Return how many different names the processes of a run have, each at most `maximum`.
+
+    All processes must call this together.
+    """
+    marks = np.zeros(maximum, np.uint32)
+    for index, name in enumerate(names):
+        marks[index] = zlib.crc32(name.encode()) or 1
+    if jax.process_count() > 1:
+        marks = multihost_utils.process_allgather(marks)
+    return len(np.unique(marks[marks > 0]))
 
 
 def is_preempted() -> bool:

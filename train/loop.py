@@ -33,7 +33,7 @@ from egosim_jax.models.layers import LowRankParam, init_sharded
 from egosim_jax.runtime.command import CommandExit, ExitCode
 from egosim_jax.sharding import assemble, batch_sharding, make_mesh, parts, process_rows
 from egosim_jax.train.config import TrainConfig, numerics_only, resume_mutable
-from egosim_jax.train.distributed import is_preempted
+from egosim_jax.train.distributed import count_distinct, is_preempted
 from egosim_jax.train.metric_writers import Console, JsonLines, TensorBoard, WandB, Writer
 from egosim_jax.train.monitor import Clock, Samples, SkipMonitor, Watchdog
 from egosim_jax.train.run_page import TIMES, write_page
@@ -202,8 +202,8 @@ class Run:
             self.skips.check()
             metrics = mean_metrics(self.pending)
         self.pending = []
-        if self.batches.skipped:
-            metrics["skipped_records"] = float(len(self.batches.skipped))
+        if bad := count_distinct(list(self.batches.skipped), Loader.MAX_BAD + 1):
+            metrics["skipped_records"] = float(bad)
         self.write(step, {**metrics, **self.clock.tick(step, self.training.steps)})
 
     def validate(self, shards: Path, step: int, state: TrainState) -> None:

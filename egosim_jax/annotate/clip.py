@@ -140,12 +140,14 @@ def open_record(job: Job, config: AnnotateConfig) -> Record:
     recording = Recording.load(Path(job.recording))
     fitted = plan(recording, config.sampling, cut=config.cutting.clips)
     frames = read_frames(recording, fitted, job.start, job.stop)
-    first, last = fitted.indices(job.start, job.stop)[[0, -1]]
+    numbers = fitted.indices(job.start, job.stop)[: len(frames)]
+    first, last = numbers[[0, -1]]
     return Record(
         video_id=job.video_id,
-        recording=recording.clip(int(first), min(int(last) + 1, recording.frames)),
+        recording=recording.clip(int(first), int(last) + 1),
         plan=fitted,
         frames=frames,
+        source_frames=numbers - first,
         device_focal_px=job.focal_px,
     )
 

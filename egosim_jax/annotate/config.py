@@ -151,12 +151,7 @@ class AnnotateConfig:
                 "Omit them."
             )
         _find(_DEPTH, self.depth, "--depth")
-        name, _ = _find(_MASKS, self.masks, "--masks")
-        if name.startswith("grounded-") != (self.detector is not None):
-            raise InputError(
-                "--masks grounded-...=FOLDER and --detector FOLDER belong together: the detector "
-                "finds the objects that the tracker follows. Give both, or neither."
-            )
+        _check_detector(self.masks, self.detector, "--masks")
 
     @property
     def depth_files(self) -> Path | None:
@@ -184,10 +179,8 @@ class AnnotateConfig:
         name, folder = _find(_CAMERAS, self.cameras, "--cameras")
         if folder is not None:
             cameras = cast(CameraEstimator, _import(_CAMERAS[name])(folder, **where))
-        name, folder = _find(_MASKS, self.masks, "--masks")
-        if folder is not None:
-            folders = [folder] if self.detector is None else [self.detector, folder]
-            segmenter = cast(Segmenter, _import(_MASKS[name])(*folders, **where))
+        if _find(_MASKS, self.masks, "--masks")[1] is not None:
+            segmenter = build_segmenter(self.masks, self.detector, **where)
         if self._captioner:
             name, folder = _find(_CAPTIONS, self.caption or "", "--caption")
             captioner = cast(Captioner, _import(_CAPTIONS[name])(folder, **where))
@@ -202,6 +195,26 @@ class AnnotateConfig:
             depth=cast(DepthEstimator, depth),
             segmenter=segmenter,
             captioner=captioner,
+        )
+
+
+def build_segmenter(
+    masks: str, detector: Path | None, *, option: str = "--masks", **where: Any
+) -> Segmenter:
+    """Return the network of a text such as sam3=FOLDER; `where` has its device and dtype."""
+    _check_detector(masks, detector, option)
+    name, folder = _find(_MASKS, masks, option)
+    folders = [folder] if detector is None else [detector, folder]
+    return cast(Segmenter, _import(_MASKS[name])(*folders, **where))
+
+
+def _check_detector(masks: str, detector: Path | None, option: str) -> None:
+    """Raise `InputError` unless a tracker has a detector, and nothing else has one."""
+    name, _ = _find(_MASKS, masks, option)
+    if name.startswith("grounded-") != (detector is not None):
+        raise InputError(
+            f"{option} grounded-...=FOLDER and --detector FOLDER belong together: the detector "
+            "finds the objects that the tracker follows. Give both, or neither."
         )
 
 

@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 from math import ceil
@@ -32,6 +33,10 @@ MAX_SIDE_PX = 832
 """Maximum longer side in pixels of clips without a given size."""
 CHUNK = 300
 """Number of frames that are decoded at a time."""
+SEARCHED_SIDE_PX = 1280
+"""Maximum longer side in pixels of the frames in which hands are searched."""
+SEARCHED_BYTES = 768 << 20
+"""Maximum memory of the frames in which hands are searched, in bytes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +65,8 @@ class Sampling:
 class Plan(Crop):
     """Frames to take from one video, and their scale and crop."""
 
+    source_size: tuple[int, int]
+    """Height and width of the video in pixels."""
     source_fps: Fraction
     """Frame rate of the video in frames per second."""
     fps: Fraction
@@ -91,11 +98,27 @@ class Plan(Crop):
 
         return self._fit(depth, cv2.INTER_NEAREST)
 
+    @no_type_check
+    def pixels(
+        self, source_px: Float[np.ndarray, "*n 2"], size: tuple[int, int]
+    ) -> Float[np.ndarray, "*n 2"]:
+        """Return where columns and rows of a frame of the video are in the clip, as `fit` does.
+
+        `size` has the height and width of the frames that the pixels are from: the video's, or of
+        frames resized from it without a crop.
+        """
+        resized = np.array(self._resized(self.source_size))
+        return (source_px + 0.5) * resized / size[::-1] - 0.5 - np.array(self.offset_px)
+
+    def _resized(self, size: tuple[int, int]) -> tuple[int, int]:
+        """Return width and height of a resized frame, before the crop."""
+        return round(size[1] * self.scale), round(size[0] * self.scale)
+
     def _fit(self, image: np.ndarray, how: int) -> np.ndarray:
         import cv2
 
         rows, columns = image.shape[:2]
-        size = round(columns * self.scale), round(rows * self.scale)
+        size = self._resized((rows, columns))
         resized = image if size == (columns, rows) else cv2.resize(image, size, interpolation=how)
         left, top = (round(offset) for offset in self.offset_px)
         return resized[top : top + self.height, left : left + self.width]
@@ -133,7 +156,11 @@ def plan(recording: Recording, sampling: Sampling, *, cut: bool) -> Plan:
         for length, kept in ((recording.width, crop.width), (recording.height, crop.height))
     )
     return Plan(
-        **{**vars(crop), "offset_px": (left, top)}, source_fps=recording.fps, fps=fps, count=count
+        **{**vars(crop), "offset_px": (left, top)},
+        source_size=source,
+        source_fps=recording.fps,
+        fps=fps,
+        count=count,
     )
 
 
@@ -155,11 +182,42 @@ def read_frames(
     Raises `InputError` if the video is damaged.
     """
     wanted = fitted.indices(start, stop)
-    wanted = wanted[wanted < recording.frames]
-    frames = np.empty((len(wanted), fitted.height, fitted.width, 3), np.uint8)
+    return _read(recording, wanted[wanted < recording.frames], fitted.fit)
+
+
+def read_searched_frames(
+    recording: Recording, wanted: Int[np.ndarray, " f"], fitted: Plan
+) -> UInt8[np.ndarray, "f h w 3"] | None:
+    """Return some frames of the video without a crop, for a search of hands.
+
+    They are reduced to 1280 pixels on the longer side, and to 768 MiB in all. Return None if they
+    would be no larger than the clip's frames.
+    """
+    import cv2
+
+    height, width = fitted.source_size
+    most = SEARCHED_BYTES / (3 * len(wanted) * height * width)
+    scale = min(1.0, SEARCHED_SIDE_PX / max(height, width), most**0.5)
+    if scale <= fitted.scale:
+        return None
+    size = round(width * scale), round(height * scale)
+
+    def reduce(frame: np.ndarray) -> np.ndarray:
+        return cv2.resize(frame, size, interpolation=cv2.INTER_AREA) if scale < 1 else frame
+
+    return _read(recording, wanted, reduce)
+
+
+def _read(
+    recording: Recording, wanted: np.ndarray, each: Callable[[np.ndarray], np.ndarray]
+) -> UInt8[np.ndarray, "f h w 3"]:
+    """Return frames of a recording, each changed by a function, decoded in parts."""
+    frames = np.empty((len(wanted), 0, 0, 3), np.uint8)
     for first in range(wanted[0], wanted[-1] + 1, CHUNK):
         here = np.flatnonzero((wanted >= first) & (wanted < first + CHUNK))
         low, high = wanted[here[0]], wanted[here[-1]]
-        chunk = recording.read_frames(int(low), int(high) + 1, each=fitted.fit).frames
+        chunk = recording.read_frames(int(low), int(high) + 1, each=each).frames
+        if not frames.size:
+            frames = np.empty((len(wanted), *chunk.shape[1:]), np.uint8)
         frames[here] = chunk[wanted[here] - low]
     return frames

@@ -4,11 +4,13 @@ A shot ends where the image changes by more than `cut_difference` gray levels an
 times the change in the frames around (adaptive content detection, as in PySceneDetect). Black
 frames belong to no shot. A clip is a window of one shot. Black, blurred, still or shaken clips are
 refused, with the decisive figure. Motion is measured in image widths, which makes the limits
-independent of the size. The first stage checks if hands are visible (`stages`).
+independent of the size. Noise is no motion: it changes the image as much between two frames as over
+half a second. The first stage checks if hands are visible (`stages`).
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -24,6 +26,14 @@ from egosim_jax.types import WAN_GRID, InputError
 
 THUMB_PX = 160
 """Width in pixels of the thumbnails for changes and motion."""
+CELL_PX = 5
+"""Width in pixels of a thumbnail's cells, whose mean colors have little noise."""
+LAG_S = 0.5
+"""Time in seconds over which motion must change the image more than noise does."""
+MIN_CHANGE, SURE_CHANGE = 1.0, 6.0
+"""Change of cells that may be motion, and change that noise never causes, in gray levels."""
+MIN_GROWTH = 1.5
+"""Minimum ratio of the change over half a second to the change between two frames."""
 SHARP_PX = 320
 """Width in pixels at which sharpness is measured."""
 
@@ -55,20 +65,20 @@ class Quality:
 
     def check(self, figures: Mapping[str, float]) -> None:
         """Raise `RefusedError` for the first rule that a clip breaks."""
-        for rule, name, bad, option in (
-            ("black", "black", figures["black"] > self.max_black, "--max-black"),
-            ("blur", "sharpness", figures["sharpness"] < self.min_sharpness, "--min-sharpness"),
-            ("still", "motion", figures["motion"] < self.min_motion, "--min-motion"),
-            ("shaken", "camera_motion", figures["camera_motion"] > self.max_motion, "--max-motion"),
+        for rule, name, sign, option, fix in (
+            ("black", "black", 1, "--max-black", "Annotate the other parts, or allow it"),
+            ("blur", "sharpness", -1, "--min-sharpness", "Take a sharper video, or allow it"),
+            ("still", "motion", -1, "--min-motion", "Annotate parts with motion, or allow it"),
+            ("shaken", "camera_motion", 1, "--max-motion", "Annotate calmer parts, or allow it"),
         ):
-            if bad:
-                limit = getattr(self, option[2:].replace("-", "_"))
+            limit = getattr(self, option[2:].replace("-", "_"))
+            if sign * figures[name] > sign * limit:
                 raise RefusedError(
                     rule,
                     f"{rule}: {name} is {unlike(figures[name], limit)}, beyond {limit:g}. "
-                    f"({option})",
+                    f"{fix}. ({option})",
                     figures,
-                )  # fmt: skip
+                )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,6 +138,7 @@ def scan(recording: Recording, fitted: Plan) -> Scan:
 
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     fps, before, rows = float(fitted.fps), None, []
+    cells: deque[np.ndarray] = deque(maxlen=max(4, round(LAG_S * fps) + 1))
     height = max(16, round(SHARP_PX * fitted.height / fitted.width))
 
     def thumb(frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
@@ -143,10 +154,12 @@ def scan(recording: Recording, fitted: Plan) -> Scan:
             small = cv2.resize(frame, (THUMB_PX, height // 2), interpolation=cv2.INTER_AREA)
             small_gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
             change, speed = 0.0, np.zeros(1)
+            cells.append(_cells(small_gray))
             if before is not None:
                 change = float(np.abs(small.astype(int) - before[0]).mean())
                 moved = flow.calc(before[1], small_gray, cast(Any, None))
                 speed = np.linalg.norm(moved, axis=-1) * fps / THUMB_PX
+                speed = speed if differs(cells[0], cells[-2], cells[-1]) else np.zeros(1)
             low_high = np.percentile(speed, (50, 95))
             sharpness = cv2.Laplacian(gray, cv2.CV_32F).var()
             rows.append((change, gray.mean(), sharpness, *low_high))
@@ -158,6 +171,26 @@ def scan(recording: Recording, fitted: Plan) -> Scan:
         sharpness=table[:, 2],
         motion=table[:, 3:],
     )
+
+
+def _cells(gray: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "r c"]:
+    import cv2
+
+    size = THUMB_PX // CELL_PX, max(1, gray.shape[0] // CELL_PX)
+    return cv2.resize(gray.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+
+
+def differs(
+    earlier: Float[np.ndarray, "r c"], last: Float[np.ndarray, "r c"], now: Float[np.ndarray, "r c"]
+) -> bool:
+    """Return True if an image moves: it differs from an earlier one by more than noise.
+
+    The images are means over cells. Noise changes an image as much since the last frame as since an
+    earlier one, and motion changes it more.
+    """
+    change = float(np.percentile(np.abs(now - earlier), 95))
+    noise = float(np.percentile(np.abs(now - last), 95))
+    return change >= MIN_CHANGE and (change >= SURE_CHANGE or change >= MIN_GROWTH * noise)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, Int32, UInt8
+from jaxtyping import Bool, Float, Int, Int32, UInt8
 
 from egosim_jax.annotate.frames import Plan
 from egosim_jax.data.recording import Recording
@@ -59,6 +59,8 @@ class Record:
     """Frame rate and crop of the clip."""
     frames: UInt8[np.ndarray, "f h w 3"]
     """Frames of the clip."""
+    source_frames: Int[np.ndarray, " f"]
+    """Number of each frame in the recording."""
     device_focal_px: float | None = None
     """Focal length in pixels of the clip, estimated from other clips of the video."""
     hands: HandTracks | None = None
@@ -67,6 +69,10 @@ class Record:
     """Object instance of each pixel: 0 background, negative for hands and arms."""
     names: Mapping[int, str] | None = None
     """Names of object instances."""
+    moved_ids: Int[np.ndarray, " n"] | None = None
+    """Object instances that hands move."""
+    contacts: Int[np.ndarray, "c 3"] | None = None
+    """Frame, side of the hand and object where a hand touches an object to move it."""
     estimate: CameraEstimate | None = None
     """Cameras and the verdict about them; in meters after the stage `scale`."""
     depth: DepthEstimate | None = None
@@ -98,6 +104,11 @@ class Record:
     def moving(self) -> Bool[np.ndarray, "f h w"]:
         """Pixels of hands and arms."""
         return self.require("object_ids") < 0
+
+    @property
+    def moved(self) -> Bool[np.ndarray, "f h w"]:
+        """Pixels of objects that hands move, after the stage `objects`."""
+        return np.isin(self.require("object_ids"), self.require("moved_ids"))
 
     @property
     def intrinsics(self) -> Float[np.ndarray, "3 3"] | None:

@@ -1,4 +1,4 @@
-"""Last stages of an annotation: metric scale, first frame without hands, scene state, caption."""
+"""Last stages of an annotation: scale, moved objects, first frame without hands, state, caption."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
 from egosim_jax.annotate.config import AnnotateConfig, Estimators
 from egosim_jax.annotate.prepare import RefusedError
@@ -25,12 +25,18 @@ from egosim_jax.annotate.stages import (
 )
 from egosim_jax.evaluation.metrics.image import decibels
 from egosim_jax.geometry import invert, pixel_rays, pixels_of, transform
+from egosim_jax.io.bounded import unlike
 from egosim_jax.perception.estimates import DepthEstimate, Rung
 from egosim_jax.rendering import POINT_PX
 from egosim_jax.rendering.reference import splat
 from egosim_jax.state.depth import state_from_depth
+from egosim_jax.state.instances import find_objects
 from egosim_jax.types import SceneState, Triplet
 
+MOVED = "moved object"
+"""Name of an object that a hand moves, if no network names it."""
+MIN_FIXED_DB = 16.0
+"""Minimum PSNR of the background if the camera stays in its place, in decibels."""
 PLATE_MARGIN = 1 / 80
 """Width of the border around hands that is replaced, too, as a fraction of the image width."""
 FRAMES_AT_ONCE = 64
@@ -39,11 +45,10 @@ FRAMES_AT_ONCE = 64
 
 def find_scale(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
     """Convert cameras, depth and joints to meters; note the scale, its source and uncertainty."""
-    from egosim_jax.perception.hands import lift
     from egosim_jax.perception.scale import Scale, estimate_scale, scale_cameras, scale_depth
 
     estimate, depth = record.require("estimate"), record.require("depth")
-    joints = None if record.hands is None else lift(record.hands, record.cameras.intrinsics_px)
+    joints = None if record.hands is None else _lifted(record)
     still = depth.metric and not estimate.metric and estimate.points is None
     if still and config.scale is None:
         scale = Scale(
@@ -70,6 +75,55 @@ def find_scale(record: Record, estimators: Estimators, config: AnnotateConfig) -
     return replace(record, joints_m=joints_in_world(record))
 
 
+def _lifted(record: Record) -> Float[np.ndarray, "f 2 21 3"]:
+    """Return the hands in meters, in the camera of each frame."""
+    from egosim_jax.perception.hands import lift, steady
+
+    return steady(lift(record.require("hands"), record.cameras.intrinsics_px), record.fps)
+
+
+def refine_scale(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
+    """Scale the scene so that fingertips have the depth of the objects that they start to move.
+
+    This replaces a scale from hands that may have touched the scene at any time. An assumed plane
+    moves behind these objects.
+    """
+    from egosim_jax.perception.scale import contact_scale, scale_cameras
+
+    record = replace(record, depth=plane_behind_objects(record))
+    contacts, joints_m = record.require("contacts"), record.joints_m
+    if record.notes["scale"]["source"] != "hands" or joints_m is None or not len(contacts):
+        return record
+    depth = record.require("depth")
+    scale = contact_scale(
+        record.cameras, depth.depth_m[0], record.require("object_ids")[0], _lifted(record), contacts
+    )
+    if scale is None:
+        return record
+    factor = scale.meters_per_unit
+    total = factor * record.notes["scale"]["meters_per_unit"]
+    record = record.add(
+        "scale", {**asdict(scale), "meters_per_unit": total},
+        estimate=scale_cameras(record.require("estimate"), scale),
+        depth=replace(depth, depth_m=(depth.depth_m * factor).astype(np.float32)),
+    )  # fmt: skip
+    return replace(record, joints_m=joints_in_world(record))
+
+
+def plane_behind_objects(record: Record) -> DepthEstimate:
+    """Return the depth with an assumed plane moved behind the moved objects, by their width."""
+    depth, own = record.require("depth"), record.moved[0]
+    if depth.confident.any() or not own.any():
+        return depth
+    numbers = record.require("moved_ids")
+    ids = record.require("object_ids")[0]
+    sides = [np.ptp(np.argwhere(ids == n), axis=0).min() + 1 for n in numbers if (ids == n).any()]
+    factor = 1 + max(sides) / record.cameras.intrinsics_px[0, 0]
+    depth_m = depth.depth_m * np.float32(factor)
+    depth_m[0][own] = depth.depth_m[0][own]
+    return replace(depth, depth_m=depth_m)
+
+
 def _sparse_depth(record: Record) -> DepthEstimate:
     """Return the triangulated points as sparse depth of the first frame, in camera units."""
     estimate = record.require("estimate")
@@ -84,13 +138,48 @@ def _sparse_depth(record: Record) -> DepthEstimate:
     )
 
 
+def find_moved_objects(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
+    """Add `moved_ids` with pixels and names, and `contacts`: the objects that hands move.
+
+    An object that a network segmented keeps its id. A sleeve counts as an arm.
+    """
+    from egosim_jax.perception.moved import find_moved
+
+    ids, names = record.require("object_ids").copy(), dict(record.names or {})
+    found = []
+    if record.hands is not None and visible(record.hands).any():
+        depth_m = record.require("depth").depth_m[0]
+        found = find_moved(record.frames, record.moving, record.hands, record.cameras, depth_m)
+    numbers: list[int] = []
+    contacts: list[tuple[int, int, int]] = []
+    for moved in found:
+        known, count = np.unique(ids[0][moved.first], return_counts=True)
+        number = int(known[count.argmax()])
+        if moved.worn:
+            number = -1
+        elif number <= 0:
+            number = max(int(ids.max()), *names, 0) + 1
+            names[number] = MOVED if MOVED not in names.values() else f"{MOVED} {number}"
+        ids[moved.shown & (ids == 0)] = number
+        if number > 0:
+            numbers.append(number)
+            contacts += [(frame, side, number) for frame, side in moved.contacts]
+    notes = {"moved": {number: int((ids[0] == number).sum()) for number in numbers}}
+    return record.add(
+        "objects", notes, object_ids=ids, names=names, moved_ids=np.array(numbers, np.int32),
+        contacts=np.array(contacts, np.int32).reshape(-1, 3),
+    )  # fmt: skip
+
+
 def clean_first_frame(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
     """Add `first_frame`: hands and arms are replaced from other frames, or inpainted."""
     from egosim_jax.perception.plate import clean_plate
 
     depth_m = record.require("depth").depth_m[0]
     margin = max(2, round(PLATE_MARGIN * record.plan.width))
-    plate = clean_plate(record.frames, record.moving, record.cameras, depth_m, margin_px=margin)
+    plate = clean_plate(
+        record.frames, record.moving, record.cameras, depth_m, moved=record.moved, margin_px=margin
+    )
     notes = {
         "hand_px": int(record.moving[0].sum()),
         "seen_px": int(plate.seen.sum()),
@@ -103,21 +192,48 @@ def build_state(record: Record, estimators: Estimators, config: AnnotateConfig) 
     """Add `state`, the scene of the prior, from the first frame or also from key frames."""
     from egosim_jax.perception.depth import points_per_pixel
 
-    cameras, ids, depth = record.cameras, record.object_ids, record.require("depth")
-    objects = None if ids is None else np.maximum(ids[0], 0)
+    cameras, depth = record.cameras, record.require("depth")
+    ids, names = np.maximum(record.require("object_ids")[0], 0), dict(record.names or {})
+    if estimators.segmenter is None and depth.confident[0].any():  # not on an assumed plane
+        standing = find_objects(
+            record.require("first_frame"), depth.depth_m[0], cameras.intrinsics_px
+        )
+        ids, names = join_objects(ids, names, standing)
     state = state_from_depth(
         record.require("first_frame"),
         depth.depth_m[0],
         cameras.intrinsics_px,
         cameras.world_from_camera[0],
-        object_ids=objects,
-        names=record.names,
+        object_ids=ids,
+        names=names,
         points_per_pixel=points_per_pixel(depth.depth_m[0], cameras),
     )
     for frame, depth_m in zip(depth.frames[1:], depth.depth_m[1:], strict=True):
         state = extend_state(state, record, int(frame), depth_m)
     state = replace(state, provenance={"source": "video", "video_id": record.video_id})
-    return record.add("scene", {"state": config.state, "points": len(state.points_m)}, state=state)
+    notes = {"state": config.state, "points": len(state.points_m), "objects": names}
+    return record.add("scene", notes, state=state)
+
+
+def join_objects(
+    ids: Int32[np.ndarray, "h w"], names: Mapping[int, str], standing: Int32[np.ndarray, "h w"]
+) -> tuple[Int32[np.ndarray, "h w"], dict[int, str]]:
+    """Return ids and names of the objects that hands move, joined by other objects.
+
+    An object whose pixels are mostly on a moved one is part of it.
+    """
+    joined, named = ids.copy(), dict(names)
+    for number in range(1, int(standing.max()) + 1):
+        own = standing == number
+        known = np.unique(ids[own & (ids > 0)], return_counts=True)
+        shared = int(known[1].max(initial=0))
+        if own.any() and 2 * shared > own.sum():
+            new = int(known[0][known[1].argmax()])
+        else:
+            new = max(int(joined.max()), *named, 0) + 1
+            named[new] = f"object {new}"
+        joined[own & (joined == 0)] = new
+    return joined, named
 
 
 def extend_state(
@@ -130,7 +246,8 @@ def extend_state(
     here = replace(record.cameras, world_from_camera=pose[None])
     # Slightly larger points than in the prior close the gaps between the points of a surface.
     seen, _ = splat(state.points_m, here, point_px=POINT_PX + 1)
-    hidden = cv2.dilate(record.moving[frame].astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    hidden = (record.moving[frame] | record.moved[frame]).astype(np.uint8)
+    hidden = cv2.dilate(hidden, np.ones((7, 7), np.uint8)) > 0
     new = ~np.isfinite(seen[0]) & ~hidden & np.isfinite(depth_m)
     rays = pixel_rays(here.intrinsics_px, height=here.height, width=here.width)[new]
     points = transform(pose, rays * depth_m[new][:, None]).astype(np.float32)
@@ -146,7 +263,8 @@ def extend_state(
 
 def add_caption(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
     """Add `prompt`: given, recorded, written by a network, or made by a rule."""
-    names = sorted(set((record.names or {}).values()) | set(record.recording.names))
+    named = {name for name in (record.names or {}).values() if not name.startswith(MOVED)}
+    names = sorted(named | set(record.recording.names))
     if config.caption_text is not None:
         prompt, source = config.caption_text, "--caption"
     elif record.recording.caption and estimators.captioner is None:
@@ -193,13 +311,16 @@ def to_triplet(record: Record, config: AnnotateConfig) -> tuple[Triplet, dict[st
             "rung": record.require("estimate").verdict.rung,
         },
     )
-    judged = drawn & ~record.moving  # not the mask: its observed region is wider than the points
+    # Not the mask: its observed region is wider than the points.
+    judged = drawn & ~record.moving & ~record.moved
+    drawn_first = _psnr(prior[:1], record.frames[:1], judged[:1])
     judged[0] = False
     first = np.broadcast_to(record.frames[0], record.frames.shape)
     return triplet, {
         "seen": float((mask == 0).mean()),
         "psnr_background": _psnr(prior, record.frames, judged),
         "psnr_first_frame": _psnr(first, record.frames, judged),
+        "psnr_drawn": drawn_first,
     }
 
 
@@ -246,16 +367,30 @@ def _psnr(
 
 
 def check_prior(rung: Rung, figures: Mapping[str, float], config: AnnotateConfig) -> None:
-    """Raise `RefusedError` if the prior shows the background worse than the first frame does."""
-    if rung in ("static", "rotation"):  # the prior is the first frame itself, at most turned
-        return
-    gain = figures["psnr_background"] - figures["psnr_first_frame"]
+    """Raise `RefusedError` if the prior shows the background worse than the first frame does.
+
+    A camera that stays or turns in its place must also show the first frame's background again.
+    """
+    fixed = rung in ("static", "rotation")  # the prior is the first frame itself, at most turned
+    shown, first = figures["psnr_background"], figures["psnr_first_frame"]
+    if fixed:  # the points do not draw the first frame exactly
+        first = -10 * np.log10(10 ** (-first / 10) + 10 ** (-figures["psnr_drawn"] / 10))
+    gain = shown - first
     limit = config.cutting.quality.min_prior_gain_db
     if gain < limit:
         raise RefusedError(
             "prior",
             f"prior: the PSNR of the background is {gain:+.1f} dB relative to the repeated first "
             f"frame, below {limit:+.1f} dB. Cameras or depth are wrong. (--min-prior-gain)",
+            figures,
+        )
+    if fixed and shown < MIN_FIXED_DB and np.isfinite(limit):
+        raise RefusedError(
+            "prior",
+            f"prior: the PSNR of the background is {unlike(shown, MIN_FIXED_DB, '.1f')} dB, below "
+            f"{MIN_FIXED_DB:g} dB: the camera seems fixed ({rung}), but the scene changes, as in a "
+            "recording of a screen. Choose another camera method (--rung), annotate other parts "
+            "(--clips), or allow it by --min-prior-gain=-inf. (--min-prior-gain)",
             figures,
         )
 
@@ -267,6 +402,8 @@ STAGES = (
     Stage("lens", undistort_clip),
     Stage("depth", find_depth, ("depth",)),
     Stage("scale", find_scale),
+    Stage("objects", find_moved_objects, ("object_ids", "names", "moved_ids", "contacts")),
+    Stage("contact", refine_scale),
     Stage("plate", clean_first_frame, ("first_frame",)),
     Stage("scene", build_state),
     Stage("caption", add_caption, ("prompt",)),

@@ -1,6 +1,7 @@
 """First stages of an annotation: hands, silhouettes, cameras, lens and depth (then `scene`).
 
-    hands -> silhouettes -> cameras -> lens -> depth -> scale -> plate -> scene -> caption
+    hands -> silhouettes -> cameras -> lens -> depth -> scale -> objects -> contact -> plate
+    -> scene -> caption
 
 A stage is a function of the record so far, the estimators and the configuration. It returns the
 record with additional fields, and notes on its choices and their reasons. Recorded cameras, hands,
@@ -20,6 +21,7 @@ from einops import rearrange
 from jaxtyping import Bool
 
 from egosim_jax.annotate.config import AnnotateConfig, Estimators, Side
+from egosim_jax.annotate.frames import read_searched_frames
 from egosim_jax.annotate.prepare import RefusedError
 from egosim_jax.annotate.record import Record
 from egosim_jax.geometry import invert, project, transform
@@ -71,7 +73,7 @@ def find_hands(record: Record, estimators: Estimators, config: AnnotateConfig) -
     elif given is not None:
         return record.add("hands", {"source": "recording", "kind": record.recording.kind})
     else:
-        tracks = drop_flashes(estimators.hands(record.frames), record.fps)
+        tracks = drop_flashes(search_hands(record, estimators), record.fps)
         hands, source = _on_side(tracks, config.side), "estimated"
     seen = visible(hands)
     shown = int(np.any(seen, axis=1).sum())
@@ -89,11 +91,27 @@ def find_hands(record: Record, estimators: Estimators, config: AnnotateConfig) -
         raise RefusedError(
             "hands",
             f"hands: visible in {shown} of {len(seen)} frames, less than "
-            f"{limit:.0%}. (--min-hands)",
+            f"{limit:.0%}. Annotate the parts that show hands (--clips), or allow fewer. "
+            "(--min-hands)",
             {"visible": share},
         )
     _check_sides(hands, seen, config.side)
     return record.add("hands", notes, hands=hands)
+
+
+def search_hands(record: Record, estimators: Estimators) -> HandTracks:
+    """Return the hands in pixels of the clip, searched in the video's frames if they are larger.
+
+    A hand with less than half of its joints inside of the clip's crop is missing.
+    """
+    frames = read_searched_frames(record.recording, record.source_frames, record.plan)
+    if frames is None:
+        return estimators.hands(record.frames)
+    found = estimators.hands(frames)
+    joints_px = record.plan.pixels(found.joints_px, (frames.shape[1], frames.shape[2]))
+    last = np.array([record.plan.width, record.plan.height]) - 0.5
+    inside = ((joints_px >= -0.5) & (joints_px <= last)).all(axis=-1).mean(axis=-1) >= 0.5
+    return _without(replace(found, joints_px=joints_px), visible(found) & ~inside)
 
 
 def _share_of_both(seen: np.ndarray) -> float:
@@ -139,7 +157,7 @@ def draw_silhouettes(record: Record, estimators: Estimators, config: AnnotateCon
         from egosim_jax.perception.silhouettes import HandShape, hand_silhouette
 
         kind, cameras = record.recording.kind, _cameras_of_given_hands(record)
-        joints = np.asarray(record.recording.joints_m)[_source_frames(record)]
+        joints = np.asarray(record.recording.joints_m)[record.source_frames]
         moving = hand_silhouette(joints, kind, cameras, HandShape()) >= 0
     else:
         from egosim_jax.perception.silhouettes import track_silhouettes
@@ -162,6 +180,11 @@ def drop_flashes(hands: HandTracks, fps: Fraction) -> HandTracks:
         for run in np.split(frames, np.flatnonzero(np.diff(frames) > HOLD_S * fps) + 1):
             if 0 < len(run) < FLASH_S * fps and found[run, 1 - side].all():
                 dropped[run, side] = True
+    return _without(hands, dropped)
+
+
+def _without(hands: HandTracks, dropped: Bool[np.ndarray, "f 2"]) -> HandTracks:
+    """Return tracks in which some hands are missing."""
     joints = dropped[..., None, None]
     return HandTracks(
         joints_px=np.where(joints, np.nan, hands.joints_px),
@@ -303,18 +326,13 @@ def _on_side(hands: HandTracks, side: Side) -> HandTracks:
     return HandTracks(**moved)
 
 
-def _source_frames(record: Record) -> np.ndarray:
-    """Return the recording's frame number of each frame of the clip."""
-    return record.plan.indices(0, len(record.frames))
-
-
 def _given_cameras(record: Record) -> Cameras | None:
     """Return the recording's cameras at the clip's frame rate and size, if it has any."""
     known, intrinsics = record.recording.world_from_camera, record.intrinsics
     if known is None or intrinsics is None:
         return None
     return Cameras(
-        world_from_camera=np.asarray(known, float)[_source_frames(record)],
+        world_from_camera=np.asarray(known, float)[record.source_frames],
         intrinsics_px=intrinsics,
         height=record.plan.height,
         width=record.plan.width,
@@ -338,30 +356,29 @@ def _given_points(record: Record) -> SparsePoints | None:
     if points is None or points.frames is None or points.pixels_px is None:
         return None
     clip_frame = np.full(record.recording.frames, -1)
-    clip_frame[_source_frames(record)] = np.arange(len(record.frames))
+    clip_frame[record.source_frames] = np.arange(len(record.frames))
     kept = clip_frame[points.frames] >= 0
     plan, pixels = record.plan, np.asarray(points.pixels_px)[kept].astype(float)
-    fitted = plan.scale * (pixels + 0.5) - 0.5 - np.array(plan.offset_px)
     errors = points.error_px
     return SparsePoints(
         points_m=points.points_m.astype(float),
         error_px=np.zeros(len(points.points_m)) if errors is None else plan.scale * errors,
         frames=clip_frame[points.frames[kept]].astype(np.int32),
         indices=np.asarray(points.indices)[kept],
-        pixels_px=fitted,
+        pixels_px=plan.pixels(pixels, plan.source_size),
     )
 
 
 def _given_depth(record: Record, frame: int) -> np.ndarray | None:
     """Return the recorded depth of a clip's frame in meters, at the clip's size, if known."""
-    depth = record.recording.read_depth(int(_source_frames(record)[frame]))
+    depth = record.recording.read_depth(int(record.source_frames[frame]))
     return None if depth is None else record.plan.fit_depth(depth)
 
 
 def _project_given(record: Record, joints_m: np.ndarray) -> HandTracks:
     """Return the recording's joints as tracks in pixels of the clip."""
     cameras = _cameras_of_given_hands(record)
-    joints = joints_m[_source_frames(record)][:, :2]
+    joints = joints_m[record.source_frames][:, :2]
     local = transform(rearrange(invert(cameras.world_from_camera), "f a b -> f 1 a b"), joints)
     pixels = np.stack(project(cameras.intrinsics_px, local), axis=-1)
     behind = (local[..., 2] <= 0).any(axis=-1)
@@ -389,12 +406,12 @@ def _camera_notes(estimate: CameraEstimate, focal_source: str) -> dict[str, Any]
 
 def joints_in_world(record: Record) -> np.ndarray:
     """Return the world joints in meters: recorded, or lifted from pixels."""
-    from egosim_jax.perception.hands import lift
+    from egosim_jax.perception.hands import lift, steady
 
     given = record.recording.joints_m
     if given is not None:
-        return given[_source_frames(record)].astype(float)
+        return given[record.source_frames].astype(float)
     cameras = record.cameras
-    local = lift(record.require("hands"), cameras.intrinsics_px)
+    local = steady(lift(record.require("hands"), cameras.intrinsics_px), record.fps)
     poses = rearrange(cameras.world_from_camera, "f a b -> f 1 a b")
     return transform(poses, local)

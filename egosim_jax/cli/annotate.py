@@ -173,7 +173,8 @@ class Annotate:
             focal = assumed[0]["focal_px"]
             print(
                 f"{len(assumed)} clips do not show their focal length: {focal:.0f} pixels of the "
-                "clip are assumed. Give it, in pixels of the video, if you know it. (--focal)",
+                "clip (a view of 90 degrees) are assumed. Give it, in pixels of the video, if you "
+                "know it. (--focal)",
                 file=sys.stderr,
             )
         print(

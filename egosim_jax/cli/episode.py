@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,6 +16,7 @@ from egosim_jax.types import InputError, check_counts, check_seed
 if TYPE_CHECKING:
     import numpy as np
 
+    from egosim_jax.data.sheet import SheetClip
     from egosim_jax.simulation import episode as episodes
     from egosim_jax.types import Action, Cameras, SceneState
 
@@ -29,6 +31,7 @@ class MakeEpisode:
     where a hand is missing. Intrinsics are in pixels of the clips: scale them with the video. A
     .json file may also have a prompt. Give the scene by --state, or by --image (without hands) and
     --depth, both seen from the first camera. An image of another shape than the clips is cropped.
+    Objects can move: --objects finds them in the image, and their names and sizes are printed.
     """
 
     out: Path
@@ -51,18 +54,32 @@ class MakeEpisode:
     """Image of the scene without hands, from the first camera, at any resolution."""
     depth: Path | None = None
     """Depth of the image in meters: an .npz file with the array depth_m."""
+    objects: str | None = None
+    """Movable objects of the image: auto, none, FILE or NETWORK=FOLDER; by default auto.
+
+    auto: what stands on a table, shelf or floor. FILE: a .png of the image's size with an object
+    id per pixel, 0 for the background. NETWORK: see --masks of `egosim data annotate`."""
+    names: tuple[str, ...] = ()
+    """Names of objects, each ID=NAME; by default "object 1" and so on."""
+    detector: Path | None = None
+    """Folder of Grounding DINO, for networks whose name begins with grounded."""
+    phrases: tuple[str, ...] = ()
+    """Names of the objects that a network segments."""
 
     def run(self) -> int:
         """Make, check and write the episode."""
         check_counts({"--clips": self.clips})
         check_seed(self.seed or 0)
-        return _save(self._own() if self.actions else self._tabletop(), self.out)
+        if not self.actions:
+            return _save(self._tabletop(), self.out)
+        return _save(self._own(), self.out, describe=True)
 
     def _tabletop(self) -> episodes.Episode:
         from egosim_jax import configs
         from egosim_jax.worlds.tabletop import make_sequence, to_episode
 
-        if given := [n for n in ("prompts", "state", "image", "depth") if getattr(self, n)]:
+        own = ("prompts", "state", "image", "depth", "objects", "names", "detector", "phrases")
+        if given := [name for name in own if getattr(self, name)]:
             raise InputError(f"--{given[0]} needs --actions: the tabletop world makes its own.")
         video = configs.get(self.config).video
         kind = "robot" if self.robot else "human"
@@ -116,6 +133,10 @@ class MakeEpisode:
             if self.depth is not None and self.state is None:
                 intrinsics = crop.source_intrinsics(cameras.intrinsics_px)
                 return self._lift(image, self.depth, intrinsics, cameras), frame
+        if given := [n for n in ("objects", "names", "detector", "phrases") if getattr(self, n)]:
+            raise InputError(
+                f"--{given[0]} needs --image and --depth: the state of --state has its own objects."
+            )
         if self.state is not None and self.depth is None:
             return _read_state(self.state), frame
         raise InputError("The scene must be given once: by --state, or by --image and --depth.")
@@ -124,6 +145,7 @@ class MakeEpisode:
         self, image: np.ndarray, depth: Path, intrinsics: np.ndarray, cameras: Cameras
     ) -> SceneState:
         """Return the points of an RGB-D image taken by the first camera."""
+        from egosim_jax.cli.objects import names_of, objects_of
         from egosim_jax.io.untrusted.npz import read_arrays
         from egosim_jax.state.depth import state_from_depth
 
@@ -134,7 +156,22 @@ class MakeEpisode:
                 "must have one value per pixel of the image as it is shown (turned as EXIF says). "
                 "Compute it from that image, or resize it to that. (--depth)"
             )
-        return state_from_depth(image, depth_m, intrinsics, cameras.world_from_camera[0])
+        ids, known = objects_of(
+            self.objects or "auto",
+            image,
+            depth_m,
+            intrinsics,
+            detector=self.detector,
+            phrases=self.phrases,
+        )
+        return state_from_depth(
+            image,
+            depth_m,
+            intrinsics,
+            cameras.world_from_camera[0],
+            object_ids=ids,
+            names=names_of(ids, known, self.names),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,7 +198,7 @@ class FromAnnotation:
 
         check_counts({"--clips": self.clips})
         episode = episode_from(self.clip, configs.get(self.config).video, clips=self.clips)
-        return _save(episode, self.out)
+        return _save(episode, self.out, describe=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,14 +234,14 @@ class FromLeRobot:
         episode = episode_from_lerobot(
             self.dataset, self.episode, video, state=state, clips=self.clips
         )
-        return _save(episode, self.out)
+        return _save(episode, self.out, describe=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CheckEpisode:
     """Validate an episode: files, joints, units, cameras, frame of reference.
 
-    Prints a summary, or the first problem and its fix.
+    Prints a summary, or the first problem and its fix. Warns of a scene without objects.
     """
 
     path: Annotated[Path, tyro.conf.Positional]
@@ -215,13 +252,17 @@ class CheckEpisode:
     def run(self) -> int:
         """Load the episode, which checks every file."""
         from egosim_jax import configs
+        from egosim_jax.cli.objects import NO_OBJECTS
         from egosim_jax.cli.simulate import check_fits
+        from egosim_jax.runtime.terminal import printable
         from egosim_jax.simulation.episode import Episode
 
         episode = Episode.load(self.path)
         if self.config is not None:
             check_fits(episode, configs.get(self.config).video, self.config)
         print(f"{self.path}: {summary(episode)}")
+        if not (episode.state.object_ids > 0).any():
+            print(printable(f"warning: {self.path}: {NO_OBJECTS}"), file=sys.stderr)
         return ExitCode.DONE
 
 
@@ -229,8 +270,9 @@ class CheckEpisode:
 class ShowEpisode:
     """Draw an episode's inputs: the rendered initial state with the hands of each clip.
 
-    Writes one contact sheet. Each clip has a row with the initial state and the hands, seen from
-    the clip's cameras, and a row of the ground truth if there is one.
+    Writes one contact sheet. The first row has the objects in their own colors, with their names.
+    Each clip has a row with the initial state and the hands, seen from the clip's cameras, and a
+    row of the ground truth if there is one.
     """
 
     path: Annotated[Path, tyro.conf.Positional]
@@ -248,7 +290,7 @@ class ShowEpisode:
 
         episode = Episode.load(self.path)
         truths = episode.ground_truth or (None,) * len(episode.actions)
-        sheet = []
+        sheet = [self._objects(episode)]
         for number, (action, truth) in enumerate(
             zip(episode.actions, truths, strict=True), start=1
         ):
@@ -261,6 +303,19 @@ class ShowEpisode:
         draw_sheet(sheet, out, moments=sheet_moments(episode.shape[0]))
         print(out)
         return ExitCode.DONE
+
+    def _objects(self, episode: episodes.Episode) -> SheetClip:
+        """Return the view of the first clip with colored objects and their names."""
+        from egosim_jax import rendering
+        from egosim_jax.data.sheet import SheetClip
+        from egosim_jax.rendering.objects import draw_objects
+
+        state, cameras = episode.state, episode.actions[0].cameras
+        view = rendering.get(self.renderer).render(state, cameras, point_px=rendering.POINT_PX)
+        numbers = sorted(set(state.object_ids[state.object_ids > 0].tolist()))
+        listed = ", ".join(state.names.get(n, f"object {n}") for n in numbers)
+        title = f"objects: {listed or 'none'}"
+        return SheetClip(title, [draw_objects(view, state.names)])
 
     def _overlay(self, state: SceneState, action: Action) -> np.ndarray:
         import numpy as np
@@ -279,10 +334,14 @@ def _read_state(path: Path) -> SceneState:
     return (read_ply if path.suffix == ".ply" else load)(path)
 
 
-def _save(episode: episodes.Episode, out: Path) -> int:
-    """Check and write the episode; print its summary."""
+def _save(episode: episodes.Episode, out: Path, *, describe: bool = False) -> int:
+    """Check and write the episode; print its summary and, with `describe`, its objects."""
     episode.save(out)
     print(f"{out}: {summary(episode)}")
+    if describe:
+        from egosim_jax.cli.objects import describe_objects
+
+        print(describe_objects(episode.state))
     return ExitCode.DONE
 
 

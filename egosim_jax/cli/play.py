@@ -80,13 +80,19 @@ class Play:
             file=sys.stderr,
             flush=True,
         )
-        generator = Generator.load(config, configs.weights_of(self.config, self.weights))
+        weights = configs.weights_of(self.config, self.weights)
+        generator = Generator.load(config, weights)
         streamer = Streamer(generator)
         world = GeneratedWorld(
-            generator=streamer, video=generator.config.video, perception=self.perception
+            generator=streamer,
+            video=generator.config.video,
+            perception=self.perception,
+            trained_on=configs.trained_on(self.config, weights),
         )
         spec = ActionSpec(sides=(self.hand,), camera=True)
         start = self._start(world, spec)
+        if note := configs.scene_warning(world.trained_on, start.state.provenance):
+            print(note, file=sys.stderr, flush=True)
         streamer.compile()
 
         def begin(seed: int) -> PlayedEpisode:

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from egosim_jax.data.sheet import SheetClip, draw_sheet
+from egosim_jax.geometry import up_of
 from egosim_jax.rendering import RendererName
-from egosim_jax.rendering.portrait import up_of, write_portrait
+from egosim_jax.rendering.portrait import write_portrait
 from egosim_jax.rendering.rerun_log import RECORDING, Recording
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.runtime.terminal import printable
@@ -121,6 +122,9 @@ class Simulate:
             file=sys.stderr,
             flush=True,
         )
+        made_on = configs.trained_on(self.config, weights)
+        if note := configs.scene_warning(made_on, episode.state.provenance):
+            print(note, file=sys.stderr, flush=True)
         simulator = Simulator(
             generator=Generator.load(config, weights, renderer=rendering.get(self.renderer)),
             perception=perception,
@@ -213,7 +217,12 @@ class _Outputs:
             zip(steps, self.episode.actions, truths, strict=True), start=1
         ):
             report.append(
-                {"clip": number, "action": action.prompt, **self._score(step, action, truth)}
+                {
+                    "clip": number,
+                    "action": action.prompt,
+                    "notes": list(step.notes),
+                    **self._score(step, action, truth),
+                }
             )
             sheet.append(self._write_step(number, step, action, truth))
             if recording is not None:
@@ -228,6 +237,8 @@ class _Outputs:
             print(folder / f"clip_{number}.mp4")
             about = f"clip {number}/{len(truths)}: {action.prompt}"
             print(printable(f"{about} ({time.monotonic() - then:.1f} s)"), file=sys.stderr)
+            for note in step.notes:
+                print(printable(f"  {note}"), file=sys.stderr)
             then = time.monotonic()
         if recording is not None:
             recording.close(state)

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from egosim_jax.geometry import Up, up_of
 from egosim_jax.io.journal import NAME as JOURNAL
-from egosim_jax.rendering.portrait import Up, up_of, write_portrait
+from egosim_jax.rendering.portrait import write_portrait
 from egosim_jax.rendering.rerun_log import RECORDING
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.runtime.terminal import printable

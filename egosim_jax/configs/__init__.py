@@ -6,6 +6,8 @@ and `generation`.
     get, names           config by name
     sampled              config with one of its named samplings
     weights_of           folder of a config's weights: given, shipped or fetched
+    trained_on           simulated world whose clips trained the weights
+    scene_warning        note about a scene that the weights were not made for
     release, releases    weights on a model hub
 """
 
@@ -15,13 +17,15 @@ import difflib
 import importlib
 import json
 import pkgutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
 from egosim_jax.io import hub
+from egosim_jax.io.bounded import read_json
 from egosim_jax.io.weights import check_folder
 from egosim_jax.types import InputError
 
@@ -135,3 +139,34 @@ def weights_of(name: str, given: Path | None) -> Path:
             "(--weights FOLDER)"
         )
     return folder
+
+
+def trained_on(name: str, folder: Path) -> str | None:
+    """Return the simulated world whose clips trained a config's weights; None if it is unknown.
+
+    It is known of the shipped weights, and of runs that made their clips themselves.
+    """
+    shipped = shipped_weights(name)
+    if shipped is not None and folder.resolve() == shipped.resolve():
+        return "tabletop"
+    run = folder.parent / "config.json"
+    if folder.name == "weights" and run.is_file():
+        with suppress(InputError):  # damaged: the world is unknown
+            written = read_json(run)
+            if isinstance(written, dict) and written.get("type") == "FromTabletop":
+                return "tabletop"
+    return None
+
+
+def scene_warning(world: str | None, provenance: Mapping[str, str]) -> str | None:
+    """Return a note in one line if weights of a world were not made for a scene, else None.
+
+    `world` is from `trained_on`, `provenance` from the scene's state.
+    """
+    if world is None or provenance.get("world") == world:
+        return None
+    return (
+        f"The weights were trained on clips of the {world} world, and this scene is not of it: "
+        f"expect poor clips. Train on your own clips ({_module('real_tiny').TRAINING}), or fetch "
+        "EgoSim's weights (egosim models fetch egosim_14b) for --config egosim_14b."
+    )

@@ -34,6 +34,7 @@ from egosim_jax.models import (
     TextEncoderConfig,
     VideoCodec,
     VideoCodecConfig,
+    abstract,
 )
 from egosim_jax.models.chunks import Chunks
 from egosim_jax.models.layers import init_sharded
@@ -301,11 +302,17 @@ class Networks(nnx.Module):
     @classmethod
     def abstract(cls, config: ModelConfig, *, only: Collection[str] | None = None) -> Networks:
         """Build the networks with shapes in place of weights."""
-        return nnx.eval_shape(lambda: cls.build(config, only=only, rngs=nnx.Rngs(0)))
+        return cls(
+            **{
+                name: abstract(network)
+                for name, network in config.networks.items()
+                if only is None or name in only
+            }
+        )
 
     @classmethod
     def random(cls, config: ModelConfig, *, seed: int) -> Networks:
-        """Build untrained networks in one compiled program."""
+        """Build untrained networks."""
         graph = nnx.graphdef(cls.abstract(config))
 
         def make(key: jax.Array) -> nnx.State:

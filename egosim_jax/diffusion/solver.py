@@ -111,7 +111,7 @@ def integrate_keeping(
     keys: Key[Array, " b"] | None = None,
 ) -> tuple[Float[Array, "b f h w c"], Kept]:
     """Return the latents, as `integrate` does, and the second result of the last evaluation."""
-    rows = _rows(process, solver, steps, keys)
+    rows = jax.tree.map(jnp.asarray, _rows(process, solver, steps, keys))
     before, last = jax.tree.map(lambda x: x[:-1], rows), jax.tree.map(lambda x: x[-1], rows)
 
     def advance(state: Any, row: tuple) -> tuple[Any, None]:

@@ -11,6 +11,9 @@ from egosim_jax.types import check_counts, check_seed
 if TYPE_CHECKING:
     from egosim_jax.generation.generator import Generator
 
+Ids = Literal["given", "none"]
+"""Object ids of a state: given, or none, so that perception must find what a hand moves."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ModelExperiment:
@@ -82,6 +85,8 @@ class Continuous(ModelExperiment):
     """Number of clips per sequence."""
     first_scene: int = 600
     """Seed of the first sequence; the shipped model was trained on seeds from 1000 on."""
+    ids: Ids = "given"
+    """Object ids in the first state of classical perception."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +101,8 @@ class Update(ModelExperiment):
     """Number of scenes in which an object is carried."""
     first_scene: int = 600
     """Seed of the first scene; the shipped model was trained on seeds from 1000 on."""
+    ids: Ids = "given"
+    """Object ids in the state of classical perception."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,6 +19,7 @@ from egosim_jax.perception import registry
 from egosim_jax.runtime.progress import track
 from egosim_jax.simulation.rollout import Rollout
 from egosim_jax.simulation.simulator import Simulator
+from egosim_jax.state.new_objects import without_ids
 from egosim_jax.types import check_counts
 from egosim_jax.worlds.tabletop import make_sequence, to_episode
 
@@ -87,13 +88,16 @@ def _simulate(settings: Continuous, generator: Generator, method: str, seed: int
     video, name = generator.config.video, METHODS[method]
     clips = list(make_sequence(seed, spec=video, clips=settings.clips))
     episode = to_episode(clips, fps=video.fps)
+    start = episode.state
+    if settings.ids == "none" and name == "classical":
+        start = without_ids(start)
     simulator = Simulator(
         generator=generator,
         perception=registry.parse(name).build(episode.observations()) if name else None,
         fps=video.fps,
     )
     steps = Rollout(simulator, folder).run(
-        episode.state, episode.actions, seed=seed, first_frame=episode.first_frame
+        start, episode.actions, seed=seed, first_frame=episode.first_frame
     )
     scores = [
         score_step(

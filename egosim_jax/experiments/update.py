@@ -14,7 +14,7 @@ from egosim_jax.evaluation.metrics.state_update import (
     object_accuracy,
     symmetric_distance,
 )
-from egosim_jax.experiments.config import Update
+from egosim_jax.experiments.config import Ids, Update
 from egosim_jax.generation.generator import Generator
 from egosim_jax.geometry import invert, pixel_rays, pixels_of, transform
 from egosim_jax.io.run import write_json
@@ -22,6 +22,7 @@ from egosim_jax.perception import registry
 from egosim_jax.rendering.reference import render
 from egosim_jax.runtime.progress import track
 from egosim_jax.state.fuse import fuse
+from egosim_jax.state.new_objects import is_among, without_ids
 from egosim_jax.types import Clip, SceneState, VideoSpec, check_counts
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, to_action, to_ground_truth
 
@@ -55,7 +56,7 @@ def run(settings: Update) -> None:
     spec = generator.config.video
     table: dict[str, list[dict[str, float]]] = {}
     for seed in track(_seeds(settings, spec), "scenes", total=settings.scenes):
-        for row, scores in _rows(seed, spec, generator):
+        for row, scores in _rows(seed, spec, generator, settings.ids):
             table.setdefault(row, []).append(scores)
     summary = {row: summarize(scores, MEASURES) for row, scores in table.items()}
     write_json(settings.out / "report.json", {"definitions": DEFINITIONS, "table": summary})
@@ -70,7 +71,7 @@ def _seeds(settings: Update, spec: VideoSpec) -> Iterator[int]:
 
 
 def _rows(
-    seed: int, spec: VideoSpec, generator: Generator
+    seed: int, spec: VideoSpec, generator: Generator, ids: Ids
 ) -> Iterator[tuple[str, dict[str, float]]]:
     """Yield the name and the scores of each table row for one scene."""
     large = next(make_sequence(seed, spec=LARGE))
@@ -79,22 +80,32 @@ def _rows(
     view = render(clip.state, clip.cameras, point_px=generator.point_px)
     generated = generator(view, to_action(clip), clip.first.colors, seed)
     yield f"oracle, {spec.width} x {spec.height}", evaluate(clip, clip.frames, "oracle")
-    yield "classical, ground-truth frames", evaluate(clip, clip.frames, "classical")
-    yield "classical, generated frames", evaluate(clip, generated, "classical")
+    yield "classical, ground-truth frames", evaluate(clip, clip.frames, "classical", ids)
+    yield "classical, generated frames", evaluate(clip, generated, "classical", ids)
     gray = np.full_like(clip.frames, 127)
-    yield "classical, gray frames", evaluate(clip, gray, "classical")
+    yield "classical, gray frames", evaluate(clip, gray, "classical", ids)
 
 
-def evaluate(clip: TabletopClip, frames: np.ndarray, perception: str) -> dict[str, float]:
+def evaluate(
+    clip: TabletopClip, frames: np.ndarray, perception: str, ids: Ids = "given"
+) -> dict[str, float]:
     """Return the scores of the state after perceiving and fusing the frames of a clip."""
     perceive = registry.parse(perception).build({clip.number: to_ground_truth(clip)})
     before = clip.state
-    perceived = perceive(Clip(frames=frames, fps=LARGE.fps), to_action(clip), before)
-    after = fuse(before, perceived)
+    given = before if ids == "given" else without_ids(before)
+    perceived = perceive(Clip(frames=frames, fps=LARGE.fps), to_action(clip), given)
+    after = fuse(given, perceived)
     number, path = clip.body_ids[clip.target], clip.world_from_body[clip.target]
     part = clip.parts[clip.target]
+    own = before.points_m[before.object_ids == number]
+    numbers = [number]
+    if ids == "none":
+        new = perceived.new_objects
+        numbers = [n for n, points in new.items() if is_among(points, own).any()]
+    still = (after.object_ids == 0) & is_among(after.points_m, own)
     carried = object_accuracy(
-        *(state.points_m[state.object_ids == number] for state in (before, after)),
+        own,
+        after.points_m[still | np.isin(after.object_ids, numbers)],
         surface=(transform(path[-1], part.vertices_m), part.triangles),
         seen_m=_visible_surface(clip, number, path),
     )

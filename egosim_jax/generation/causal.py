@@ -127,9 +127,9 @@ class ChunkDenoiser:
 
     def _program(self, number: int) -> Any:
         def run(dit: CausalDenoiser, *given: Any) -> tuple[Array, Any]:
-            arrays, seeds = given[:4], given[4:]
-            keys = (keys_for(s, SOLVER_NOISE) for s in seeds)
-            return denoise_chunk(dit, *arrays, self.config, number, *keys)
+            channels, noise, shared, cache, *seeds = given
+            keys = keys_for(seeds[0], SOLVER_NOISE) if seeds else None
+            return denoise_chunk(dit, channels, noise, shared, cache, self.config, number, keys)
 
         return run
 

@@ -13,6 +13,7 @@ satisfy the Protocols of this module.
 
 from __future__ import annotations
 
+import functools
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 from flax import nnx
@@ -295,4 +296,10 @@ class Flops(NamedTuple):
 
 def abstract(config: NetworkConfig) -> Any:
     """Build a config's network with shapes in place of weights."""
+    return nnx.clone(_traced(config))
+
+
+@functools.cache
+def _traced(config: NetworkConfig) -> Any:
+    """Trace the construction, which takes a second, once; callers get copies."""
     return nnx.eval_shape(lambda: config.build(rngs=nnx.Rngs(0)))

@@ -167,14 +167,13 @@ def modulate(
 def init_sharded(make: Callable[..., Any], *args: Any, out_shardings: Any = None) -> Any:
     """Run an initializer as one compiled program, with sharded outputs.
 
-    With its key in `args`, the program is the same for every seed. It draws hundreds of arrays and
-    runs once. On a CPU it is compiled without optimization, which would take longer than training a
-    tiny model.
+    With its key in `args`, the program is the same for every seed. Alone on a CPU, it runs
+    operation by operation: it draws hundreds of arrays once, of few shapes, and to compile all as
+    one program takes longer than to train a tiny model.
     """
-    program = jax.jit(make, out_shardings=out_shardings).lower(*args)
-    on_cpu = jax.default_backend() == "cpu"
-    options = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-    return program.compile(compiler_options=options if on_cpu else None)(*args)
+    if jax.default_backend() == "cpu" and jax.process_count() == 1:
+        return jax.device_put(make(*args), out_shardings, may_alias=False)
+    return jax.jit(make, out_shardings=out_shardings)(*args)
 
 
 def stack(make: Callable[[nnx.Rngs], Block], layers: int, *, rngs: nnx.Rngs) -> Block:

@@ -4,13 +4,16 @@ Cameras and hand joints are the generator's inputs. The stages then run in this 
 
     HandMasks          draws hands and arms from the joints
     TrackObjects       finds the motion of a held object that best explains the clip's colors
-    RevealedSurfaces   extends the supporting surface to where the object was
+    MovedObjects       sets the depth of the object where it moved
+    NewSurfaces        continues planes of the state where it has no points
 
 Depth is set only where the clip differs from the view of the previous state. Elsewhere depth is
 unknown, and the state does not change.
 
-Limits: each object must be a separate instance in the state, and so must the moving part of an
-articulated object. One hand at a time moves an object, and objects do not topple.
+A hand that closes on something without an id makes it a new object (`growth`), if the clip shows
+that it moves with the hand.
+
+Limits: one hand at a time moves an object, and objects do not topple.
 """
 
 from __future__ import annotations
@@ -19,19 +22,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
 
-from egosim_jax.geometry import cameras_in_object_frame, pixel_rays
+from egosim_jax.geometry import cameras_in_object_frame
+from egosim_jax.perception.new_surfaces import NewSurfaces
 from egosim_jax.perception.object_motion import TrackObjects
 from egosim_jax.perception.pipeline import Observation, Pipeline
 from egosim_jax.perception.registry import register
 from egosim_jax.perception.silhouettes import HandShape, hand_silhouette
 from egosim_jax.rendering.reference import splat
-from egosim_jax.types import Action, Cameras, Clip, SceneState, check_counts
+from egosim_jax.types import Action, Clip, SceneState, check_counts
 
 
 def take_action(clip: Clip, action: Action, state: SceneState, so_far: Observation) -> Observation:
-    """Set cameras and hand joints to the generator's inputs, and no new names."""
+    """Set cameras and hand joints to the generator's inputs, and no names yet."""
     return replace(so_far, cameras=action.cameras, joints_m=action.joints_m, names={})
 
 
@@ -50,8 +53,8 @@ class HandMasks(HandShape):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RevealedSurfaces:
-    """Stage that sets depth and ids of moved objects and of the surfaces that they revealed."""
+class MovedObjects:
+    """Stage that sets depth and ids of moved objects."""
 
     point_px: int = 2
     """Size of the state's rendered points, in pixels."""
@@ -63,47 +66,23 @@ class RevealedSurfaces:
     def __call__(
         self, clip: Clip, action: Action, state: SceneState, so_far: Observation
     ) -> Observation:
-        """Set `depth_m` (infinite where nothing changed, and at hands) and `object_ids`."""
-        cameras, hand_ids, motions, planes = (
-            so_far.require(field, "RevealedSurfaces")
-            for field in ("cameras", "object_ids", "motions", "support_planes")
+        """Set `depth_m` (infinite where no object moved, and at hands) and `object_ids`."""
+        cameras, hand_ids, motions = (
+            so_far.require(field, "MovedObjects") for field in ("cameras", "object_ids", "motions")
         )
-        depth, ids = self._changes(cameras, state, motions, planes)
-        hidden = hand_ids < 0
-        return replace(
-            so_far,
-            depth_m=np.where(hidden, np.inf, depth).astype(np.float32),
-            object_ids=np.where(hidden, hand_ids, ids).astype(np.int32),
-        )
-
-    def _changes(
-        self,
-        cameras: Cameras,
-        state: SceneState,
-        motions: Mapping[int, Float[np.ndarray, "f 4 4"]],
-        planes: Mapping[int, Float[np.ndarray, " 4"]],
-    ) -> tuple[Float32[np.ndarray, "f h w"], Int32[np.ndarray, "f h w"]]:
-        """Return depth and object ids of changed pixels, and infinity and 0 elsewhere."""
-        shape = (len(cameras.world_from_camera), cameras.height, cameras.width)
-        depth, ids = np.full(shape, np.inf, np.float32), np.zeros(shape, np.int32)
+        depth, ids = np.full(hand_ids.shape, np.inf, np.float32), hand_ids.copy()
         if not motions:
-            return depth, ids
-        held = np.isin(state.object_ids, list(motions))
-        rest, _ = splat(state.points_m[~held], cameras, point_px=self.point_px)
-        _, index = splat(state.points_m[held], cameras, point_px=self.point_px)
-        before = np.append(state.object_ids[held], np.int32(0))[index]
-        # First all revealed surfaces, then all moved objects: an object may end on such a surface.
-        for number in motions:
-            revealed = (before == number) & ~np.isfinite(rest)
-            depth[revealed] = np.minimum(depth, plane_depth(planes[number], cameras))[revealed]
+            return replace(so_far, depth_m=depth)
+        rest = state.points_m[~np.isin(state.object_ids, list(motions))]
+        nearest, _ = splat(rest, cameras, point_px=self.point_px)
         for number, motion in motions.items():
             points = state.points_m[state.object_ids == number].astype(float)
-            moved, index = splat(
-                points, cameras_in_object_frame(cameras, motion), point_px=self.point_px
-            )
-            nearer = (index >= 0) & (moved < np.minimum(depth, rest))
-            depth[nearer], ids[nearer] = moved[nearer], number
-        return depth, ids
+            local = cameras_in_object_frame(cameras, motion)
+            moved, index = splat(points, local, point_px=self.point_px)
+            nearer = (index >= 0) & (moved < nearest) & (hand_ids >= 0)
+            nearest[nearer] = depth[nearer] = moved[nearer]
+            ids[nearer] = number
+        return replace(so_far, depth_m=depth, object_ids=ids)
 
 
 @register("classical")
@@ -115,22 +94,11 @@ class ClassicalConfig:
     """Drawing of hands and arms."""
     motion: TrackObjects = field(default_factory=TrackObjects)
     """Estimation of the motion of held objects."""
-    surfaces: RevealedSurfaces = field(default_factory=RevealedSurfaces)
-    """Depth of moved objects and of the surfaces behind them."""
+    moved: MovedObjects = field(default_factory=MovedObjects)
+    """Depth of moved objects."""
+    new: NewSurfaces = field(default_factory=NewSurfaces)
+    """Depth of surfaces that the state does not have."""
 
     def build(self, ground_truth: Mapping[int, Observation] | None = None) -> Pipeline:
         """Return the classical perception pipeline; the ground truth is not used."""
-        return Pipeline(stages=(take_action, self.hands, self.motion, self.surfaces))
-
-
-def plane_depth(plane: Float[np.ndarray, " 4"], cameras: Cameras) -> Float32[np.ndarray, "f h w"]:
-    """Return the depth of a plane (a, b, c, d) in meters; infinite where a ray misses it."""
-    rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
-    normal, offset = plane[:3], plane[3]
-    depths = []
-    for pose in cameras.world_from_camera:
-        height = pose[:3, 3] @ normal + offset
-        with np.errstate(divide="ignore", invalid="ignore"):
-            along = -height / (rays @ pose[:3, :3].T @ normal)
-        depths.append(np.where(along > 0, along, np.inf))
-    return np.array(depths, np.float32)
+        return Pipeline(stages=(take_action, self.hands, self.motion, self.moved, self.new))

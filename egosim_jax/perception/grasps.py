@@ -9,22 +9,121 @@ motion of the palm. A lid or door turns about the axis of the fingertips' arc (`
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from egosim_jax.geometry import hinge_rotation, umeyama
+from egosim_jax.perception.silhouettes import PALM
 from egosim_jax.types import Kind
 
 TIPS: dict[Kind, list[int]] = {"human": [4, 8, 12], "robot": [1, 2]}
 """Grasping joints: tips of thumb, index and middle finger; both jaws of a gripper."""
 MIN_HELD = 2
 """Minimum number of frames between a grasp and a release."""
+MAX_NOISE = 0.1
+"""Maximum noise of the opening: the 25th percentile of its bends, in tolerances of a hold."""
+MIN_BENDS = 8
+"""Minimum number of bends that show the noise of an opening."""
+MAX_ENDS = 24
+"""Maximum number of frames at which a hold may begin or end if the opening is no evidence."""
+MAX_DEPTH_M = 0.06
+"""Maximum distance of a grip behind the visible side of the gripped object, in meters."""
+FIT_M = 0.01
+"""Error of the width of a gripped object on either side, in meters."""
 MIN_ARC_DEG = 25.0
 """Minimum angle of an arc, in degrees; a shorter arc does not determine its axis."""
 MAX_ARC_ERROR = 0.05
 """Maximum distance of the fingertips from an arc, as a fraction of its radius."""
+FIRM_TOUCH_M = 0.015
+"""Maximum distance of fingertips inside or outside the surface of an object that they hold."""
+FIRM_TRAVEL_M = 0.03
+"""Minimum distance that a hand carries what it holds firmly, in meters."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grip:
+    """Joints of one hand, and the times at which it may have held an object."""
+
+    palm_m: Float[np.ndarray, "f j 3"]
+    tips_m: Float[np.ndarray, "f t 3"]
+    holds: list[tuple[int, int]]
+    """Frames of the grasp and of the release of each possible hold."""
+    sure: bool
+    """True if the hand surely held something."""
+    radius_m: float
+    """Maximum distance of a gripped point from the line between the fingertips, in meters."""
+    eyes_m: Float[np.ndarray, "f 3"]
+    """Place of the camera in each frame."""
+
+    @classmethod
+    def of(
+        cls,
+        joints_m: Float[np.ndarray, "f j 3"],
+        kind: Kind,
+        eyes_m: Float[np.ndarray, "f 3"],
+        *,
+        tolerance_m: float,
+        radius_m: float,
+    ) -> Grip:
+        """Return the grip of a hand whose opening changes by at most a tolerance in a hold.
+
+        Missing frames are completed (`complete_hand`), and a hold is within the frames in between.
+        """
+        seen = seen_frames(joints_m)
+        joints_m = complete_hand(joints_m, seen)
+        tips, palm = joints_m[:, TIPS[kind]], joints_m[:, PALM[kind]]
+        first = int(seen[0])
+        holds, sure = find_holds(tips[first : int(seen[-1]) + 1], tolerance_m)
+        holds = [(grasped + first, released + first) for grasped, released in holds]
+        return cls(
+            palm_m=palm, tips_m=tips, holds=holds, sure=sure, radius_m=radius_m, eyes_m=eyes_m
+        )
+
+    @property
+    def grasps(self) -> list[int]:
+        """Frames at which a possible hold begins."""
+        return sorted({grasped for grasped, _ in self.holds})
+
+    @cached_property
+    def rigid(self) -> dict[int, Float[np.ndarray, "f 4 4"]]:
+        """Motion of the palm since each grasp."""
+        return {grasped: palm_motion(self.palm_m, grasped) for grasped in self.grasps}
+
+    @cached_property
+    def hinges(self) -> dict[tuple[int, int], Float[np.ndarray, "f 4 4"] | None]:
+        """Motion about a hinge in each hold; None without a hinge."""
+        return {hold: hinge_motion(self.tips_m, hold) for hold in self.holds}
+
+    def has(self, points_m: Float[np.ndarray, "n 3"], grasped: int) -> bool:
+        """Return True if the hand surely holds an object that has these points at a grasp."""
+        tips, eye = self.tips_m[grasped], self.eyes_m[grasped]
+        return self.sure and (
+            is_between(points_m, tips, self.radius_m)
+            or is_behind(points_m, tips, eye, self.radius_m)
+        )
+
+
+def seen_frames(joints_m: Float[np.ndarray, "f j 3"]) -> Int[np.ndarray, " k"]:
+    """Return the frames with a hand."""
+    return np.flatnonzero(np.isfinite(joints_m).all(axis=(1, 2)))
+
+
+def complete_hand(
+    joints_m: Float[np.ndarray, "f j 3"], seen: Int[np.ndarray, " k"]
+) -> Float[np.ndarray, "f j 3"]:
+    """Return a hand that is interpolated between the frames in which it is seen.
+
+    Before it enters and after it leaves the view, it rests where it was seen.
+    """
+    if len(seen) == len(joints_m):
+        return joints_m
+    flat, frames = joints_m.reshape(len(joints_m), -1), np.arange(len(joints_m))
+    complete = [np.interp(frames, seen, values) for values in flat[seen].T]
+    return np.stack(complete, axis=1).reshape(joints_m.shape)
 
 
 def find_holds(
@@ -35,12 +134,16 @@ def find_holds(
     A held object keeps the fingertips at a constant distance. A hold begins when the hand closes,
     or at the first frame, and ends when it opens, or at the last frame. A hand that never closes
     may have held an object while its opening was steady. If the opening is always or never steady,
-    it is no evidence, and any two frames may be a hold.
+    or has noise as in a video, it is no evidence, and any two frames may be a hold: any two of some
+    frames of a long clip.
     """
     opening = np.linalg.norm(tips_m[:, 0] - tips_m[:, 1:].mean(axis=1), axis=-1)
     pairs = [(g, r) for g, r in combinations(range(len(tips_m)), 2) if r - g >= MIN_HELD]
-    if np.ptp(opening) <= tolerance_m:
-        return pairs, False
+    bends = np.abs(np.diff(opening, 2))
+    noise = np.percentile(bends, 25) if len(bends) >= MIN_BENDS else 0.0
+    if np.ptp(opening) <= tolerance_m or noise > MAX_NOISE * tolerance_m:
+        ends = set(np.linspace(0, len(opening) - 1, MAX_ENDS).astype(int).tolist())
+        return [pair for pair in pairs if ends.issuperset(pair)], False
     steady = [(g, r) for g, r in pairs if np.ptp(opening[g : r + 1]) <= tolerance_m]
     longest = [(g, r) for g, r in steady if (g - 1, r) not in steady and (g, r + 1) not in steady]
     padded = np.pad(opening, 1, constant_values=np.inf)  # may hold from frame 0 on
@@ -54,11 +157,68 @@ def is_between(
     points_m: Float[np.ndarray, "n 3"], tips_m: Float[np.ndarray, "j 3"], radius_m: float
 ) -> bool:
     """Return True if some point is between the thumb and the fingers, within a radius in meters."""
+    share, away = from_grip(points_m, tips_m)
+    return bool(((share > 0) & (share < 1) & (away <= radius_m)).any())
+
+
+def from_grip(
+    points_m: Float[np.ndarray, "n 3"], tips_m: Float[np.ndarray, "j 3"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return points' places between thumb (0) and fingers (1), and distances from there in meters.
+
+    Places outside of the grip are clipped to its ends.
+    """
     thumb, fingers = tips_m[0], tips_m[1:].mean(axis=0)
     across = fingers - thumb
-    share = (points_m - thumb) @ across / max(across @ across, 1e-12)
-    away = np.linalg.norm(points_m - thumb - share[:, None] * across, axis=1)
-    return bool(((share > 0) & (share < 1) & (away <= radius_m)).any())
+    share = np.clip((points_m - thumb) @ across / max(across @ across, 1e-12), 0, 1)
+    return share, np.linalg.norm(points_m - thumb - share[:, None] * across, axis=1)
+
+
+def is_behind(
+    points_m: Float[np.ndarray, "n 3"],
+    tips_m: Float[np.ndarray, "j 3"],
+    eye_m: Float[np.ndarray, " 3"],
+    radius_m: float,
+) -> bool:
+    """Return True if the line from the thumb to the fingers is inside an object behind its points.
+
+    Only the side of an object that the camera sees has points. It must fill most of the space
+    between the fingertips. It may be wider than that, as the base of a cone is, but not by much.
+    """
+    thumb, fingers = tips_m[0], tips_m[1:].mean(axis=0)
+    opening = max(float(np.linalg.norm(fingers - thumb)), 1e-9)
+    across = (fingers - thumb) / opening
+    ray = eye_m - (thumb + fingers) / 2
+    ray -= (ray @ across) * across
+    ray /= max(float(np.linalg.norm(ray)), 1e-9)
+    along = (points_m - thumb) @ across
+    away = points_m - thumb - along[:, None] * across
+    toward = away @ ray
+    aside = np.linalg.norm(away - toward[:, None] * ray, axis=1)
+    front = along[(aside <= radius_m) & (toward >= 0) & (toward <= MAX_DEPTH_M)]
+    if not len(front):
+        return False
+    slack = opening / 2 + FIT_M
+    fits = front.min() >= -slack and front.max() <= opening + slack
+    return bool(fits and np.ptp(np.clip(front, 0, opening)) >= opening / 2)
+
+
+def is_firm(
+    faces: Float[np.ndarray, "m 4"], tips_m: Float[np.ndarray, "f j 3"], hold: tuple[int, int]
+) -> bool:
+    """Return True if the fingertips close on two sides of an object, and then carry it away.
+
+    `faces` are the outward planes of the object's convex hull at the grasp. Both thumb and fingers
+    must touch the hull, with the middle between them inside it.
+    """
+    grasped, released = hold
+    thumb, fingers = tips_m[:, 0], tips_m[:, 1:].mean(axis=1)
+    middle = (thumb + fingers) / 2
+    carried = middle[grasped : released + 1] - middle[grasped]
+    places = np.stack([thumb[grasped], fingers[grasped], middle[grasped]])
+    outside = (places @ faces[:, :3].T + faces[:, 3]).max(axis=1)
+    touched = np.abs(outside[:2]).max() <= FIRM_TOUCH_M and outside[2] < 0
+    return bool(touched and np.linalg.norm(carried, axis=1).max() >= FIRM_TRAVEL_M)
 
 
 def palm_motion(palm_m: Float[np.ndarray, "f j 3"], grasped: int) -> Float[np.ndarray, "f 4 4"]:

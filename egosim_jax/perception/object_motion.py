@@ -4,8 +4,9 @@ A grasped object moves with the hand. A candidate combines an object near a fing
 of a possible hold, and a motion of the hand that the object may follow (`grasps`). Its cost is the
 mean difference between the object's colors and the clip's colors where the object would be visible.
 The candidate that most improves on the object at rest is accepted. An object between the closing
-fingertips counts as moved unless the clip clearly shows it at rest. A released object falls
-(`fall`), and `pose_refinement` refines its last pose.
+fingertips counts as moved unless the clip clearly shows it at rest. If they hold nothing with an
+id, candidates are grown from the points between them (`growth`), and `extent` chooses how far. A
+released object falls (`fall`) or is put down (`snap`), and `pose_refinement` refines its last pose.
 """
 
 from __future__ import annotations
@@ -16,15 +17,11 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from egosim_jax.geometry import invert, pixels_of, transform
-from egosim_jax.perception.grasps import (
-    TIPS,
-    couplings,
-    find_holds,
-    hinge_motion,
-    is_between,
-    palm_motion,
-)
+from egosim_jax.geometry import UP_AXES, Up, invert, pixels_of, transform, up_of
+from egosim_jax.perception.extent import Candidate, choose_extent, moving_part
+from egosim_jax.perception.grasps import MIN_HELD, Grip, couplings, is_firm, seen_frames
+from egosim_jax.perception.growth import NEW, Growth, clusters_without_id
+from egosim_jax.perception.hulls import hull_on_plane
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.perception.pose_refinement import (
     ColorCost,
@@ -33,9 +30,9 @@ from egosim_jax.perception.pose_refinement import (
     Refinement,
     refine_pose,
 )
-from egosim_jax.perception.silhouettes import PALM
-from egosim_jax.rendering.portrait import UP_AXES, Up, up_of
-from egosim_jax.types import Action, Cameras, Clip, InputError, Kind, SceneState, check_counts
+from egosim_jax.state.new_objects import next_object_id, with_objects
+from egosim_jax.state.planes import fit_plane
+from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState, check_counts
 
 GRAVITY = 9.81
 """Acceleration of a fall in m/s^2."""
@@ -43,6 +40,8 @@ MIN_LIFT_M = 0.01
 """Minimum height of a release above the first height, in meters; below it nothing falls."""
 FOOTPRINT_M = 0.006
 """Horizontal distance within which the state's points are below an object, in meters."""
+SNAP_M = 0.02
+"""Maximum height error of a released object, above or below its support, in meters."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +66,10 @@ class TrackObjects:
     """Maximum distance of a gripped object from the line between the fingertips, in meters."""
     grip_evidence: float = 8.0
     """Maximum cost of a gripped object's motion above the cost at rest, in 8-bit levels."""
+    firm_evidence: float = 90.0
+    """The same for an object that a hand holds firmly and carries away.
+
+    A generated clip may leave an object where the state has it, as if no hand had taken it."""
     prompt_prior: float = 0.9
     """Cost factor of an object that the prompt names."""
     plane_tolerance_m: float = 0.006
@@ -75,10 +78,14 @@ class TrackObjects:
     """Radius around the object's center in which points determine its plane, in meters."""
     blur_px: float = 0.7
     """Sigma of the Gaussian blur of the clip: generated frames are softer than points."""
+    growth: Growth = field(default_factory=Growth)
+    """Segmentation of an object without an id."""
+    part: float = 0.9
+    """Maximum size of a moving part, as a fraction of the whole connected cluster."""
     color: ColorCost = field(default_factory=ColorCost)
     """Comparison of the clip's colors with the predicted colors."""
     refinement: Refinement = field(
-        default_factory=partial(Refinement, deviation_m=0.005, deviation_deg=5.0)
+        default_factory=partial(Refinement, deviation_m=0.003, deviation_deg=5.0)
     )
     """Refinement of the object's last pose."""
 
@@ -97,10 +104,13 @@ class TrackObjects:
             so_far.require(name, "TrackObjects") for name in ("cameras", "joints_m", "object_ids")
         )
         action = replace(action, cameras=cameras, joints_m=joints)
-        moved = estimate_object_motion(clip, action, state, ids < 0, self)
+        moved, new, notes = estimate_object_motion(clip, action, state, ids < 0, self)
         frames = np.arange(len(clip.frames))
         return replace(
             so_far,
+            new_objects=new,
+            names={**(so_far.names or {}), **{number: f"object {number}" for number in new}},
+            notes=(*so_far.notes, *notes),
             motions={m.model.number: m.path for m in moved},
             support_planes={m.model.number: m.model.plane for m in moved},
             interacted_frames={
@@ -115,29 +125,44 @@ def estimate_object_motion(
     state: SceneState,
     hidden: Bool[np.ndarray, "f h w"],
     config: TrackObjects,
-) -> list[ObjectMotion]:
-    """Return the motions of the objects that hands moved, at most one for each hand.
+) -> tuple[list[ObjectMotion], dict[int, Float32[np.ndarray, "n 3"]], list[str]]:
+    """Return the motions of the objects that hands moved, the new objects' points, and notes.
 
-    If two hands claim an object, the hand that explains the colors better gets it. `hidden` marks
-    the pixels that hands cover. A hand that is missing in any frame is ignored.
+    Each hand moves at most one object. If two hands claim an object, the hand that explains the
+    colors better gets it. `hidden` marks the pixels that hands cover. A hand may
+    be missing from some frames (`Grip`). Without an object with an id in its grip, a hand may move
+    a new one: it gets the next free id.
     """
     shown = _smooth(clip.frames, config.blur_px)
     found: dict[int, tuple[float, ObjectMotion]] = {}
+    new: dict[int, Float32[np.ndarray, "n 3"]] = {}
+    notes: list[str] = []
     for hand in range(action.joints_m.shape[1]):
         joints = action.joints_m[:, hand]
-        if np.isfinite(joints).all():
-            best = _best_candidate(joints, action, state, shown, hidden, config)
+        if len(seen_frames(joints)) > MIN_HELD:
+            best, note = _best_candidate(joints, action, state, shown, hidden, config)
+            if best is not None and best[1].model.number == NEW:
+                change, motion = best
+                number = next_object_id(state)
+                motion = replace(motion, model=replace(motion.model, number=number))
+                best = change, motion
+                new[number] = motion.model.points_m.astype(np.float32)
+                state = with_objects(state, new)
+                note = f"moved something without an id: it is object {number} now"
+            if note:
+                notes.append(f"hand {hand} {note}")
             if best is not None:
                 change, motion = best
                 others = state.points_m[state.object_ids != motion.model.number]
-                motion = fall(motion, others, clip.fps)
+                motion = snap(fall(motion, others, clip.fps), others)
                 motion = refine_pose(
                     motion, action.cameras, state, shown, hidden, config.refinement, config.color
                 )
+                motion = snap(motion, others)
                 number = motion.model.number
                 if number not in found or change < found[number][0]:
                     found[number] = change, motion
-    return [motion for _, motion in found.values()]
+    return [motion for _, motion in found.values()], new, notes
 
 
 def _best_candidate(
@@ -147,50 +172,101 @@ def _best_candidate(
     shown: Float32[np.ndarray, "f h w 3"],
     hidden: Bool[np.ndarray, "f h w"],
     config: TrackObjects,
-) -> tuple[float, ObjectMotion] | None:
-    """Return the best accepted candidate of one hand, after its change of cost.
+) -> tuple[Candidate | None, str]:
+    """Return the best accepted candidate of one hand, and a note.
+
+    If the hand holds no object that has an id, it may move one that has none.
+    """
+    grip = Grip.of(
+        joints_m,
+        action.kind,
+        action.cameras.world_from_camera[:, :3, 3],
+        tolerance_m=config.opening_tolerance_m,
+        radius_m=config.grip_radius_m,
+    )
+    found: list[Candidate] = []
+    held = False
+    for number in _near_tips(grip.tips_m, state, config):
+        model = object_model(number, state, config)
+        held |= any(grip.has(model.points_m, grasped) for grasped in grip.grasps)
+        name = state.names.get(number, "").lower()
+        prior = config.prompt_prior if name and name in action.prompt.lower() else 1.0
+        best = _best_motion(model, grip, prior, action.cameras, shown, hidden, config)
+        found += [best] if best else []
+    if held:
+        return min(found, key=lambda candidate: candidate[0], default=None), ""
+    clusters, note = clusters_without_id(grip, action.cameras, state, config.growth)
+    for growths in clusters:
+        tried = [
+            _best_motion(model, grip, 1.0, action.cameras, shown, hidden, config)
+            for model in growths
+        ]
+        moved = [best for best in tried if best is not None]
+        if moved:
+            part = moving_part(moved[0][1], action.cameras, shown, hidden, config.color)
+            if config.min_points <= len(part.points_m) < config.part * len(growths[0].points_m):
+                best = _best_motion(part, grip, 1.0, action.cameras, shown, hidden, config)
+                moved += [best] if best else []
+            scene = action.cameras, state, shown, hidden, config.color
+            found.append(moved[choose_extent(moved, growths, *scene)])
+    if found:
+        return min(found, key=lambda candidate: candidate[0]), ""
+    if clusters and grip.sure:
+        note = "closed on something without an id that the clip shows at rest"
+    return None, note
+
+
+def _best_motion(
+    model: ObjectModel,
+    grip: Grip,
+    prior: float,
+    cameras: Cameras,
+    shown: Float32[np.ndarray, "f h w 3"],
+    hidden: Bool[np.ndarray, "f h w"],
+    config: TrackObjects,
+) -> Candidate | None:
+    """Return the best accepted motion of an object with one hand, after its change of cost.
 
     The change is relative to the object at rest, because an object in the table's color costs
     little anywhere. It is 0 if the object is not visible, and lower for an object in the grip.
     """
-    best: tuple[float, ObjectMotion] | None = None
-    palm, tips = joints_m[:, PALM[action.kind]], joints_m[:, TIPS[action.kind]]
-    holds, sure = find_holds(tips, config.opening_tolerance_m)
-    rigid = {grasped: palm_motion(palm, grasped) for grasped in {hold[0] for hold in holds}}
-    hinges = {hold: hinge_motion(tips, hold) for hold in holds}
-    for number in _near_tips(joints_m, action.kind, state, config):
-        model = object_model(number, state, config)
-        name = state.names.get(number, "").lower()
-        prior = config.prompt_prior if name and name in action.prompt.lower() else 1.0
-        still = np.repeat(np.eye(4)[None], len(joints_m), axis=0)
-        rest = _cost(model, still, action.cameras, shown, hidden, config)
-        improvement = max(config.min_improvement, (1 - config.max_cost_ratio) * rest)
-        for hold in holds:
-            gripped = sure and is_between(model.points_m, tips[hold[0]], config.grip_radius_m)
-            max_change = config.grip_evidence if gripped else -improvement
-            loose = couplings(palm, rigid[hold[0]], model.plane[:3], hold)
-            for path in (*loose, hinges[hold]):
-                if path is None:
-                    continue
-                cost = prior * _cost(model, path, action.cameras, shown, hidden, config)
-                known = np.isfinite(cost) and np.isfinite(rest)
-                change = (cost - rest if known else 0.0) - max_change
-                if change < (0.0 if best is None else best[0]):
-                    hinged = path is hinges[hold]
-                    best = (
-                        change,
-                        ObjectMotion(
-                            model=model, grasped=hold[0], released=hold[1], path=path, hinged=hinged
-                        ),
-                    )
+    best: Candidate | None = None
+    still = np.repeat(np.eye(4)[None], len(shown), axis=0)
+    rest = _cost(model, still, cameras, shown, hidden, config)
+    improvement = max(config.min_improvement, (1 - config.max_cost_ratio) * rest)
+    faces = hull_on_plane(model.points_m, model.plane)
+    for hold in grip.holds:
+        gripped = grip.has(model.points_m, hold[0])
+        max_change = config.grip_evidence if gripped else -improvement
+        if gripped and faces is not None and is_firm(faces, grip.tips_m, hold):
+            max_change = config.firm_evidence
+        loose = couplings(grip.palm_m, grip.rigid[hold[0]], model.plane[:3], hold)
+        hinge = grip.hinges[hold]
+        for path in (*loose, hinge):
+            if path is None:
+                continue
+            cost = prior * _cost(model, path, cameras, shown, hidden, config)
+            known = np.isfinite(cost) and np.isfinite(rest)
+            change = (cost - rest if known else 0.0) - max_change
+            if change < (0.0 if best is None else best[0]):
+                best = (
+                    change,
+                    ObjectMotion(
+                        model=model,
+                        grasped=hold[0],
+                        released=hold[1],
+                        path=path,
+                        hinged=path is hinge,
+                    ),
+                )
     return best
 
 
 def _near_tips(
-    joints_m: Float[np.ndarray, "f j 3"], kind: Kind, state: SceneState, config: TrackObjects
+    tips_m: Float[np.ndarray, "f t 3"], state: SceneState, config: TrackObjects
 ) -> list[int]:
     """Return the ids of the objects near a fingertip."""
-    tips = joints_m[:, TIPS[kind]].reshape(-1, 3)
+    tips = tips_m.reshape(-1, 3)
     near = []
     for number in np.unique(state.object_ids[state.object_ids > 0]).tolist():
         points = state.points_m[state.object_ids == number]
@@ -225,18 +301,11 @@ def _support_plane(
 
     With too few points, return a horizontal plane of unknown height.
     """
-    import open3d as o3d
-    from threadpoolctl import threadpool_limits
-
     distances = np.linalg.norm(others_m - points_m.mean(axis=0), axis=1)
     near = others_m[distances < config.plane_radius_m]
     if len(near) < config.min_points:
         return np.array([*UP_AXES[up], np.nan])
-    o3d.utility.random.seed(0)
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(near))
-    with threadpool_limits(1, user_api="openmp"):  # its threads race, and runs would differ
-        plane, _ = cloud.segment_plane(config.plane_tolerance_m, 3, 500)
-    return np.array(plane)
+    return fit_plane(near, config.plane_tolerance_m)[0]
 
 
 def fall(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"], fps: int) -> ObjectMotion:
@@ -245,23 +314,47 @@ def fall(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"], fps: int) -
     `others_m` are the other points of the state. An object does not fall if it was not lifted, if
     it is on a hinge, or if a hand holds it to the end.
     """
-    released, last = motion.released, len(motion.path) - 1
-    normal, offset = motion.model.plane[:3], motion.model.plane[3]
-    if motion.hinged or released == last or not np.isfinite(offset):
+    if not motion.lands:
         return motion
+    up, gap = _gap_below(motion, others_m)
     first = motion.model.points_m
-    side = 1.0 if first.mean(axis=0) @ normal + offset > 0 else -1.0
-    up, floor = side * normal, float(-side * offset)
-    end = transform(motion.path[released], first)
-    if ((end - first) @ up).mean() < MIN_LIFT_M:
+    if ((transform(motion.path[motion.released], first) - first) @ up).mean() < MIN_LIFT_M:
         return motion
-    # Not the clearance alone: only the visible side has points, so it is not 0 on the ground.
-    gap = _clearance(end, others_m, up, floor) - _clearance(first, others_m, up, floor)
-    seconds = np.maximum(np.arange(last + 1) - released, 0) / fps
+    seconds = np.maximum(np.arange(len(motion.path)) - motion.released, 0) / fps
     drop = np.minimum(GRAVITY / 2 * seconds**2, max(gap, 0.0))
     path = motion.path.copy()
     path[:, :3, 3] -= drop[:, None] * up
     return replace(motion, path=path)
+
+
+def snap(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"]) -> ObjectMotion:
+    """Return the motion with a released object at its first height above the surface below it.
+
+    The correction grows from the grasp to the release. Objects that do not `fall` are not snapped,
+    and none whose height differs by more than `SNAP_M`.
+    """
+    if not motion.lands:
+        return motion
+    up, gap = _gap_below(motion, others_m)
+    if abs(gap) > SNAP_M:
+        return motion
+    path = motion.path.copy()
+    path[:, :3, 3] -= motion.carried[:, None] * gap * up
+    return replace(motion, path=path)
+
+
+def _gap_below(
+    motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, " 3"], float]:
+    """Return the direction up, and how much higher above its support the object ends, in meters."""
+    normal, offset = motion.model.plane[:3], motion.model.plane[3]
+    first, end = motion.model.points_m, transform(motion.path[-1], motion.model.points_m)
+    side = 1.0 if first.mean(axis=0) @ normal + offset > 0 else -1.0
+    up, floor = side * normal, float(-side * offset)
+    # Not the clearance alone: only the visible side has points, so it is not 0 on the ground.
+    # Before the grasp, points above the object's lowest ones are next to it, or left of it.
+    under = others_m[others_m @ up < np.quantile(first @ up, 0.02) + FOOTPRINT_M]
+    return up, _clearance(end, others_m, up, floor) - _clearance(first, under, up, floor)
 
 
 def _clearance(

@@ -12,13 +12,14 @@ for tests and upper bounds.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, no_type_check, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32
 
 from egosim_jax.state.filter import interacted_frames
+from egosim_jax.state.new_objects import with_objects
 from egosim_jax.types import Action, Cameras, Clip, InputError, Perceived, SceneState
 
 
@@ -52,6 +53,10 @@ class Observation:
     """Frames in which hands acted on each object; only objects with at least one."""
     names: Mapping[int, str] | None = None
     """Object names by id; names that the state has may be omitted."""
+    new_objects: Mapping[int, Float32[np.ndarray, "n 3"]] = field(default_factory=dict)
+    """Points of the state that are an object without an id, by its new id."""
+    notes: tuple[str, ...] = ()
+    """New objects, and what could not be decided, in words for reports."""
 
     def require(self, field: str, needed_by: str) -> Any:
         """Return a field. Raises `InputError` with both names if no stage has set it."""
@@ -74,6 +79,8 @@ class Observation:
         return Perceived(
             step=state.step + 1,
             frames=clip.frames,
+            new_objects=self.new_objects,
+            notes=self.notes,
             world_from_object={
                 number: motion @ state.world_from_object.get(number, np.eye(4))
                 for number, motion in motions.items()
@@ -106,6 +113,7 @@ class Pipeline:
     def __call__(self, clip: Clip, action: Action, state: SceneState) -> Perceived:
         """Run the stages and return their result in world coordinates.
 
+        After a stage that finds new objects, the state that later stages get has them.
         Raises `InputError` if a stage's depth or ids do not have one value per pixel, and if a
         stage or `Perceived` needs a field that no stage has set.
         """
@@ -113,6 +121,7 @@ class Pipeline:
         for stage in self.stages:
             so_far = stage(clip, action, state, so_far)
             _check_shapes(so_far, clip, stage)
+            state = with_objects(state, so_far.new_objects)
         return so_far.finish(clip, state)
 
 
@@ -129,11 +138,11 @@ def find_interactions(
 
 def _check_shapes(so_far: Observation, clip: Clip, stage: Stage) -> None:
     shape = clip.frames.shape[:3]
-    for field in ("depth_m", "object_ids"):
-        value = getattr(so_far, field)
+    for name in ("depth_m", "object_ids"):
+        value = getattr(so_far, name)
         if value is not None and value.shape != shape:
-            name = getattr(stage, "__name__", type(stage).__name__)
+            culprit = getattr(stage, "__name__", type(stage).__name__)
             raise InputError(
-                f"Perception stage {name} returned {field} of shape {value.shape} for a clip of "
+                f"Perception stage {culprit} returned {name} of shape {value.shape} for a clip of "
                 f"shape {shape}: it must have one value per pixel of each frame."
             )

@@ -1,10 +1,10 @@
 """Clean plate: the first frame without hands.
 
 Each pixel behind a hand comes from the nearest frame in time that sees the same scene point. That
-frame must also look alike around the point. So an object that a hand moves later stays at its
-first place; a temporal median would erase it. Pixels that no frame shows are inpainted with patches
-of the rest of the image (PatchMatch; Barnes et al. 2009), or by Telea's method if that library is
-not installed.
+frame must also look alike around the point, and nothing that a hand moves may be there. So an
+object that a hand moves later stays at its first place; a temporal median would erase it. Pixels
+that no frame shows are inpainted with patches of the background (PatchMatch; Barnes et al. 2009),
+or by Telea's method if that library is not installed. Moved objects are never copied.
 """
 
 from __future__ import annotations
@@ -52,18 +52,24 @@ def clean_plate(
     cameras: Cameras,
     depth_m: Float[np.ndarray, "h w"],
     *,
+    moved: Bool[np.ndarray, "f h w"] | None = None,
     margin_px: int = 3,
 ) -> CleanPlate:
     """Return the first frame with its `moving` pixels replaced by the scene behind them.
 
     `depth_m` is the first frame's depth in the unit of the cameras, completed behind the hands. A
-    pixel of unknown depth is inpainted. `moving` is widened by a margin.
+    pixel of unknown depth is inpainted. `moved` are the pixels of objects that hands move: they
+    stay in the first frame, and nothing is taken from them. Both masks are widened by a margin.
     """
     import cv2
 
     margin = np.ones((2 * margin_px + 1,) * 2, np.uint8)
     hide = np.stack([cv2.dilate(m.astype(np.uint8), margin) for m in moving]) > 0
     image, missing = frames[0].copy(), hide[0].copy()
+    carried = np.zeros_like(missing)
+    if moved is not None:
+        carried = cv2.dilate(moved[0].astype(np.uint8), margin) > 0
+        hide[1:] |= np.stack([cv2.dilate(m.astype(np.uint8), margin) > 0 for m in moved[1:]])
     ring = cv2.dilate(missing.astype(np.uint8), np.ones((2 * RING_PX + 1,) * 2, np.uint8)) > 0
     rows, columns = np.nonzero(ring & np.isfinite(depth_m))
     rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
@@ -75,13 +81,13 @@ def clean_plate(
         if not wanted.any():
             break
         colors, free = _look_up(frames[frame], hide[frame], cameras, frame, points)
-        border = free & ~hide[0][rows, columns]
+        border = free & ~(hide[0] | carried)[rows, columns]
         gain = _gain(image[rows, columns][border], colors[border])
         alike = _agreement(image, colors * gain, rows, columns, border)
         taken = free & wanted & (alike >= MIN_AGREEMENT)
         image[rows[taken], columns[taken]] = np.clip(colors[taken] * gain + 0.5, 0, 255)
         missing[rows[taken], columns[taken]] = False
-    image, method = _inpaint(image, missing)
+    image, method = _inpaint(image, missing, carried & ~missing)
     return CleanPlate(image=image, seen=hide[0] & ~missing, method=method)
 
 
@@ -150,9 +156,11 @@ def _agreement(
 
 
 def _inpaint(
-    image: UInt8[np.ndarray, "h w 3"], missing: Bool[np.ndarray, "h w"]
+    image: UInt8[np.ndarray, "h w 3"],
+    missing: Bool[np.ndarray, "h w"],
+    excluded: Bool[np.ndarray, "h w"],
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Inpainter]:
-    """Return the inpainted image and the name of the method."""
+    """Return the inpainted image and the name of the method; `excluded` pixels are no source."""
     if not missing.any():
         return image, "none"
     try:
@@ -160,6 +168,8 @@ def _inpaint(
     except ImportError:
         import cv2
 
-        return cv2.inpaint(image, missing.astype(np.uint8), PATCH, cv2.INPAINT_TELEA), "telea"
-    hole = missing[..., None].astype(np.uint8)
-    return patch_match.inpaint(image, hole, patch_size=PATCH), "patchmatch"
+        hole = (missing | excluded).astype(np.uint8)
+        filled = cv2.inpaint(image, hole, PATCH, cv2.INPAINT_TELEA)
+        return np.where(missing[..., None], filled, image), "telea"
+    hole, ignored = (mask[..., None].astype(np.uint8) for mask in (missing, excluded))
+    return patch_match.inpaint(image, hole, global_mask=ignored, patch_size=PATCH), "patchmatch"

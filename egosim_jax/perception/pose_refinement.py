@@ -31,13 +31,19 @@ class ColorCost:
     max_light: float = 1.2
     """Maximum light on the object, relative to the state's."""
 
+    def apart(
+        self, shown: Float32[np.ndarray, "*#n 3"], expected: Float32[np.ndarray, "*#n 3"]
+    ) -> Float32[np.ndarray, "*n"]:
+        """Return color differences in 8-bit levels; those from an expected color of NaN are NaN."""
+        strength = np.maximum((expected**2).sum(axis=-1), 1)
+        light = np.clip((shown * expected).sum(axis=-1) / strength, self.min_light, self.max_light)
+        return np.sqrt(np.square(shown - light[..., None] * expected).mean(axis=-1))
+
     def mean(
         self, shown: Float32[np.ndarray, "n 3"], expected: Float32[np.ndarray, "n 3"]
     ) -> float:
         """Return the mean color difference in 8-bit levels; an expected color of NaN is unknown."""
-        strength = np.maximum((expected**2).sum(axis=1), 1)
-        light = np.clip((shown * expected).sum(axis=1) / strength, self.min_light, self.max_light)
-        gaps = np.sqrt(np.square(shown - light[:, None] * expected).mean(axis=1))
+        gaps = self.apart(shown, expected)
         gaps = np.where(np.isnan(gaps), self.unknown_residual, gaps)
         return float(np.minimum(gaps, self.max_residual).mean())
 
@@ -100,6 +106,18 @@ class ObjectMotion:
     hinged: bool = False
     """True for a part that turns about an axis and stays on it, such as a lid."""
 
+    @property
+    def lands(self) -> bool:
+        """True if the object is put down on a known surface before the clip ends."""
+        released = self.released < len(self.path) - 1
+        return released and not self.hinged and bool(np.isfinite(self.model.plane[3]))
+
+    @property
+    def carried(self) -> Float[np.ndarray, " f"]:
+        """Fraction of the frames between grasp and release that has passed at each frame."""
+        frames = np.arange(len(self.path)) - self.grasped
+        return np.clip(frames / (self.released - self.grasped), 0, 1)
+
 
 def refine_pose(
     best: ObjectMotion,
@@ -112,35 +130,35 @@ def refine_pose(
 ) -> ObjectMotion:
     """Return the motion with a last pose that explains the clip better.
 
-    The motion is unchanged if hands cover the object to the end.
+    The motion is unchanged if hands cover the object to the end, or if the clip is more like the
+    scene without the object: then it does not show it anywhere near.
     """
     frames = np.arange(len(best.path))[min(best.released, len(best.path) - config.min_frames) :]
     scene = _Neighborhood.of(best, cameras, state, frames, shown, hidden, config)
     if not scene.compared.any():
         return best
-    share = np.clip(
-        (np.arange(len(best.path)) - best.grasped) / (best.released - best.grasped), 0, 1
-    )
     far, turned = config.deviation_m or np.inf, np.radians(config.deviation_deg or np.inf)
     scale = np.array([far, far, far, turned])
     change, best_cost = np.zeros(4), scene.cost(best.path[frames], color)
+    # An object that was put down stays on the surface: its height is known.
+    axes = np.linalg.svd(best.model.plane[None, :3])[2][1:] if best.lands else np.eye(3)
     for meters, degrees in zip(config.steps_m, config.steps_deg, strict=True):
-        steps = np.diag([meters, meters, meters, np.radians(degrees)])
+        steps = [*np.pad(meters * axes, [(0, 0), (0, 1)]), np.array([0, 0, 0, np.radians(degrees)])]
         improved = True
         while improved:
             improved = False
-            for step in (*steps, *-steps):
-                cost = scene.cost(perturb(best, change + step, share)[frames], color)
+            for step in (*steps, *(-step for step in steps)):
+                cost = scene.cost(perturb(best, change + step)[frames], color)
                 cost += float(np.square((change + step) / scale).sum())
                 if cost < best_cost:
                     change, best_cost, improved = change + step, cost, True
-    return replace(best, path=perturb(best, change, share))
+    if best_cost > scene.cost_without(color):
+        return best
+    return replace(best, path=perturb(best, change))
 
 
-def perturb(
-    best: ObjectMotion, change: Float[np.ndarray, " 4"], share: Float[np.ndarray, " f"]
-) -> Float[np.ndarray, "f 4 4"]:
-    """Return the path with a fraction of a change applied in each frame.
+def perturb(best: ObjectMotion, change: Float[np.ndarray, " 4"]) -> Float[np.ndarray, "f 4 4"]:
+    """Return the path with a change that grows from the grasp to the release.
 
     The change is a translation in meters, and a rotation about the plane's normal through the
     object's center in radians.
@@ -149,7 +167,7 @@ def perturb(
 
     center = transform(best.path, best.model.points_m.mean(axis=0)[None])[:, 0]
     changes = np.repeat(np.eye(4)[None], len(best.path), axis=0)
-    for matrix, part, point in zip(changes, share, center, strict=True):
+    for matrix, part, point in zip(changes, best.carried, center, strict=True):
         matrix[:3, :3] = cv2.Rodrigues(part * change[3] * best.model.plane[:3])[0]
         matrix[:3, 3] = point + part * change[:3] - matrix[:3, :3] @ point
     return changes @ best.path
@@ -205,3 +223,7 @@ class _Neighborhood:
         nearer = (index >= 0) & (depth < self.background_m)
         drawn = np.where(nearer[..., None], self.model.colors[index], self.background)
         return color.mean(self.shown[self.compared], drawn[self.compared])
+
+    def cost_without(self, color: ColorCost) -> float:
+        """Return the mean difference between the clip and a rendering without the object."""
+        return color.mean(self.shown[self.compared], self.background[self.compared])

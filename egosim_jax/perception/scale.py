@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int
 
-from egosim_jax.geometry import pixel_rays, pixels_of, transform
+from egosim_jax.geometry import invert, pixel_rays, pixels_of, transform
 from egosim_jax.perception.estimates import CameraEstimate, DepthEstimate
 from egosim_jax.rendering.reference import splat
 from egosim_jax.types import Cameras, InputError
@@ -113,6 +113,39 @@ def estimate_scale(
         source="median depth",
         reason=f"assumed: no hand, camera height or metric depth gives the scale, so the median "
         f"depth is set to {ASSUMED_MEDIAN_M} m",
+    )
+
+
+def contact_scale(
+    cameras: Cameras,
+    depth_m: Float[np.ndarray, "h w"],
+    object_ids: Int[np.ndarray, "h w"],
+    joints_camera_m: Float[np.ndarray, "f n 21 3"],
+    contacts: Int[np.ndarray, "c 3"],
+) -> Scale | None:
+    """Return the scale at which fingertips touch the objects that they begin to move.
+
+    `depth_m` and `object_ids` are the first frame's. A contact has frame, hand and object. Return
+    None with too few fingertips.
+    """
+    rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
+    ratios: list[float] = []
+    for frame, hand, number in contacts.tolist():
+        own = (object_ids == number) & np.isfinite(depth_m)
+        if own.any():
+            center = np.median(rays[own] * depth_m[own][:, None], axis=0)
+            world = transform(cameras.world_from_camera[0], center[None])
+            local = transform(invert(cameras.world_from_camera[frame]), world)[0]
+            ratios += (joints_camera_m[frame, hand, FINGERTIPS, 2] / local[2]).tolist()
+    known = np.array(ratios)[np.isfinite(ratios)] if ratios else np.zeros(0)
+    if len(known) < len(FINGERTIPS):
+        return None
+    low, middle, high = np.percentile(known, (16, 50, 84))
+    return Scale(
+        meters_per_unit=float(middle),
+        uncertainty=float(np.hypot(HAND_SIZE_ERROR, (high - low) / 2 / middle)),
+        source="hands",
+        reason=f"median of {len(known)} fingertips at objects that they begin to move",
     )
 
 

@@ -4,21 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from egosim_jax.geometry import look_at
+from egosim_jax.geometry import UP_AXES, Up, look_at
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.rendering.reference import render
 from egosim_jax.types import Cameras, SceneState
 
-Up = Literal["z", "-y"]
-"""Axis of the world that points up: z in the tabletop world, -y in EgoSim's first camera."""
-UP_AXES: dict[Up, tuple[float, float, float]] = {"z": (0.0, 0.0, 1.0), "-y": (0.0, -1.0, 0.0)}
-"""Unit vector of each axis that may point up."""
 SIDES, ABOVE = (-40.0, 0.0, 40.0), 30.0
 """Angles of the cameras in degrees: around the vertical axis, and above the horizon."""
 DISTANCE, FIELD_OF_VIEW = 3.0, 50.0
@@ -31,11 +26,6 @@ MIN_RADIUS_M, MAX_RADIUS_M = 0.02, 20.0
 """Smallest and largest radius that is drawn as it is; the renderer draws from 1 cm to 100 m."""
 MAX_POINT_PX = 16
 """Maximum size of a point in pixels: a sparse cloud would be slow, and hide itself."""
-
-
-def up_of(state: SceneState) -> Up:
-    """Return the axis that points up in a state's world, by its provenance."""
-    return "z" if state.provenance.get("world") == "tabletop" else "-y"
 
 
 def write_portrait(path: Path, state: SceneState, *, up: Up) -> None:

@@ -10,8 +10,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from egosim_jax.geometry import Up
 from egosim_jax.io.atomic import atomic_write
-from egosim_jax.rendering.portrait import Up
 from egosim_jax.rendering.skeleton import SKELETONS
 
 if TYPE_CHECKING:

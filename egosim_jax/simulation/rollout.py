@@ -114,7 +114,7 @@ class Rollout:
             save=snapshot.save,
             load=snapshot.load,
         )
-        return Step(view=view, clip=clip, state=after)
+        return Step(view=view, clip=clip, state=after, notes=perceived.notes)
 
 
 def _save_frames(path: Path, clip: Clip) -> None:

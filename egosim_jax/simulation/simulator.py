@@ -59,6 +59,8 @@ class Step:
     """Clip generated from the view and the action."""
     state: SceneState
     """State after the step."""
+    notes: tuple[str, ...] = ()
+    """Words of the perception: new objects, and what it could not decide."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,13 +102,17 @@ class Simulator:
         """
         view = self.render(state, action)
         clip = self.generate(view, action, seed=seed, first_frame=first_frame)
-        return Step(view=view, clip=clip, state=self.update(state, clip, action))
+        after, notes = self.update(state, clip, action)
+        return Step(view=view, clip=clip, state=after, notes=notes)
 
-    def update(self, state: SceneState, clip: Clip, action: Action) -> SceneState:
-        """Perceive a clip and fuse it into the state."""
+    def update(
+        self, state: SceneState, clip: Clip, action: Action
+    ) -> tuple[SceneState, tuple[str, ...]]:
+        """Perceive a clip and fuse it; return the state after it, and the perception's notes."""
         if self.perception is None:
-            return state
-        return fuse(state, self.perception(clip, action, state), fusion=self.fusion)
+            return state, ()
+        perceived = self.perception(clip, action, state)
+        return fuse(state, perceived, fusion=self.fusion), perceived.notes
 
     def render(self, state: SceneState, action: Action) -> View:
         """Render the state along the action's camera path."""

@@ -15,6 +15,14 @@ DEPTH_M = (0.05, 50.0)
 """Minimum and maximum median depth, in meters."""
 EDGE = 0.03
 """Maximum relative change of depth by interpolation; beyond it, a pixel keeps its own depth."""
+STEEP = 4.0
+"""Minimum step of the depth at an edge, in widths of a pixel's footprint: a slope of 76 degrees."""
+MIN_SMEARED = 0.25
+"""Minimum fraction of edges that are ramps; in a depth image with fewer, a ramp is a surface."""
+MAX_RAMP_PX = 6
+"""Maximum number of pixels between the two surfaces of an edge."""
+FLAT = 0.01
+"""Maximum relative bend of inverse depth over three pixels of a surface."""
 
 
 @no_type_check  # shapes and dtypes are checked with messages for users
@@ -31,12 +39,42 @@ def state_from_depth(
     """Return the state of one RGB-D image without hands: points of the pixels with known depth.
 
     Depth is in meters along the camera's z axis; 0, NaN and infinity mean unknown. Pixel centers
-    are at integer coordinates. Without `object_ids` all points are background. Each pixel gives
-    `points_per_pixel` squared points, interpolated: a camera that moves nearer by this factor sees
-    no gaps. Raises `InputError` if shapes or dtypes differ, if no depth is known, or if the depth
-    does not look like meters.
+    are at integer coordinates. `object_ids` has the object of each pixel, 0 for the background
+    (`find_objects` finds them), and `names` their names; without it nothing has an id. Each pixel
+    gives `points_per_pixel` squared points, interpolated: a camera that moves nearer by this factor
+    sees no gaps. Pixels between two surfaces (`between_surfaces`) give none. Raises `InputError` if
+    shapes or dtypes differ, if no depth is known, or if the depth does not look like meters.
     """
     check_counts({"points_per_pixel": points_per_pixel})
+    known = known_depth(image, depth_m, intrinsics_px, object_ids)
+    ids = np.zeros(depth_m.shape, np.int32) if object_ids is None else object_ids
+    matrix = upsample_intrinsics(np.asarray(intrinsics_px, float), points_per_pixel)
+    if points_per_pixel > 1:
+        image, depth_m, known, ids = _split(image, depth_m, known, ids, points_per_pixel)
+    rays = pixel_rays(matrix, height=depth_m.shape[0], width=depth_m.shape[1])[known]
+    points = transform(world_from_camera, rays * depth_m[known][:, None])
+    return SceneState(
+        points_m=points.astype(np.float32),
+        colors=image[known],
+        object_ids=ids[known].astype(np.int32),
+        last_seen=np.zeros(len(points), np.int32),
+        intrinsics_px=intrinsics_px,
+        names=dict(names or {}),
+        provenance={"source": "depth image"},
+    )
+
+
+@no_type_check  # shapes and dtypes are checked with messages for users
+def known_depth(
+    image: UInt8[np.ndarray, "_ _ 3"],
+    depth_m: Float[np.ndarray, "h w"],
+    intrinsics_px: Float[np.ndarray, "3 3"],
+    object_ids: Int[np.ndarray, "_ _"] | None = None,
+) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels with the depth of a surface: positive, finite, not between two surfaces.
+
+    Raises `InputError` as `state_from_depth` does.
+    """
     for name, value, rule, fits in (
         ("depth_m", depth_m, "(height, width)", np.ndim(depth_m) == 2),
         (
@@ -69,21 +107,42 @@ def state_from_depth(
             f"The median depth is {median:.4g}: in meters it must be from {DEPTH_M[0]} to "
             f"{DEPTH_M[1]}. Convert depth_m to meters (millimeters / 1000)."
         )
-    ids = np.zeros(depth_m.shape, np.int32) if object_ids is None else object_ids
-    matrix = upsample_intrinsics(np.asarray(intrinsics_px, float), points_per_pixel)
-    if points_per_pixel > 1:
-        image, depth_m, known, ids = _split(image, depth_m, known, ids, points_per_pixel)
-    rays = pixel_rays(matrix, height=depth_m.shape[0], width=depth_m.shape[1])[known]
-    points = transform(world_from_camera, rays * depth_m[known][:, None])
-    return SceneState(
-        points_m=points.astype(np.float32),
-        colors=image[known],
-        object_ids=ids[known].astype(np.int32),
-        last_seen=np.zeros(len(points), np.int32),
-        intrinsics_px=intrinsics_px,
-        names=dict(names or {}),
-        provenance={"source": "depth image"},
-    )
+    smeared = between_surfaces(np.where(known, depth_m, np.nan), float(intrinsics_px[0][0]))
+    return known & ~smeared
+
+
+def between_surfaces(depth_m: Float[np.ndarray, "h w"], focal_px: float) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels whose depth is between two surfaces that they do not belong to.
+
+    Along a row or a column, such pixels are a short steep ramp with a surface at each end. A sharp
+    edge has no pixel on its ramp; where most edges are sharp, nothing is found. Depth is NaN where
+    it is unknown.
+    """
+    found = np.zeros(depth_m.shape, bool)
+    edges = ramps = 0
+    for depth, target in ((depth_m, found), (depth_m.T, found.T)):
+        inverse = 1 / depth
+        step = np.diff(depth, axis=1)
+        limit = STEEP / focal_px * np.minimum(depth[:, :-1], depth[:, 1:])
+        sign = np.where(np.abs(step) > limit, np.sign(step), 0)  # 0 for NaN, too
+        flat = np.zeros(depth.shape, bool)  # three pixels of a surface, by the middle one
+        bend = inverse[:, :-2] - 2 * inverse[:, 1:-1] + inverse[:, 2:]
+        flat[:, 1:-1] = (sign[:, :-1] == 0) & (sign[:, 1:] == 0)
+        flat[:, 1:-1] &= np.abs(bend) <= FLAT * inverse[:, 1:-1]
+        for length in range(MAX_RAMP_PX + 1):
+            # Columns: surface 0 to 2, ramp 3 to 2 + length, surface 3 + length to 5 + length.
+            count = depth.shape[1] - length - 5
+            if count < 1:
+                break
+            ramp = flat[:, 1 : 1 + count] & flat[:, 4 + length : 4 + length + count]
+            first = sign[:, 2 : 2 + count]
+            for column in range(length + 1):
+                ramp &= (sign[:, 2 + column : 2 + column + count] == first) & (first != 0)
+            edges += int(ramp.sum())
+            ramps += int(ramp.sum()) if length else 0
+            for column in range(3, 3 + length):
+                target[:, column : column + count] |= ramp
+    return found & (ramps >= MIN_SMEARED * edges)
 
 
 def _split(

@@ -1,5 +1,6 @@
 """State update: U of EgoSim's equation S_k = U(S_{k-1}, O_k).
 
+0. Points that the clip shows to be an object get its new id (`new_objects`).
 1. Depth is fused into surfaces, without the hands: one for everything static, and one for each
    tracked object in its own coordinates, so that all frames contribute wherever the object was.
 2. Points of the state that belong to a tracked object move with it.
@@ -22,6 +23,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from egosim_jax.geometry import cameras_in_object_frame, invert, pixels_of, transform
 from egosim_jax.state.filter import disappeared_objects
+from egosim_jax.state.new_objects import with_objects
 from egosim_jax.state.tsdf import Fusion, surface, valid_depth_mask
 from egosim_jax.types import Perceived, SceneState
 
@@ -54,6 +56,7 @@ class _Points:
 
 def fuse(state: SceneState, perceived: Perceived, *, fusion: Fusion | None = None) -> SceneState:
     """Return the state after a clip; a clip without known depth keeps the points."""
+    state = with_objects(state, perceived.new_objects)
     disappeared = disappeared_objects(perceived.object_ids, dict(perceived.interacted_frames))
     disappeared -= set(perceived.world_from_object)
     valid = valid_depth_mask(perceived.depth_m)

@@ -248,6 +248,10 @@ class Perceived:
     """Poses of tracked objects; the first frame has the pose of the state before."""
     interacted_frames: Mapping[int, Bool[np.ndarray, " f"]]
     """Frames in which hands acted on each object; objects without any are absent."""
+    new_objects: Mapping[int, Float32[np.ndarray, "n 3"]] = field(default_factory=dict)
+    """Points of the state before the clip that the clip shows to be an object, by its new id."""
+    notes: tuple[str, ...] = ()
+    """New objects, and what could not be decided, in words for reports."""
 
 
 @no_type_check

@@ -36,7 +36,7 @@ class Fuzz:
         columns = (*GOOD, "other")
         print(f"{'format':<24}{'cases':>8}{'kinds':>7}" + "".join(f"{c:>14}" for c in columns))
         total = bad = 0
-        for name in self.targets or targets():
+        for name in self.targets or [target.name for target in targets()]:
             counts = run(name, seed=self.seed, cases=self.cases, seconds=self.seconds)
             shown = [counts.outcomes[outcome] for outcome in GOOD] + [counts.bad]
             row = "".join(f"{count:>14,}" for count in shown)

@@ -11,6 +11,8 @@ import sys
 import tempfile
 import traceback
 import warnings
+from collections.abc import Iterator
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -21,17 +23,17 @@ from tests.fuzz.mutations import BYTES
 from tests.fuzz.target import Target
 
 MODULES = (
-    "targets_run", "targets_convert", "targets_media", "targets_data", "targets_recordings",
-    "targets_serving", "targets_expanding",
+    "targets_media", "targets_data", "targets_recordings", "targets_run", "targets_serving",
+    "targets_convert", "targets_expanding",
 )  # fmt: skip
+"""Modules of the targets; those that import much are last."""
 MAX_SECONDS, MAX_BYTES, MAX_MESSAGE = 20, 1 << 30, 4000
 
 
-def targets() -> dict[str, Target]:
-    """Every target by its name."""
-    modules = [n for n in MODULES if (Path(__file__).parent / f"{n}.py").exists()]
-    found = [t for name in modules for t in import_module(f"tests.fuzz.{name}").TARGETS]
-    return {target.name: target for target in found}
+def targets() -> Iterator[Target]:
+    """Every target; a module is imported when its targets are asked for."""
+    for name in MODULES:
+        yield from import_module(f"tests.fuzz.{name}").TARGETS
 
 
 def fuzz(target: Target, *, seed: int, first: int, cases: int) -> None:
@@ -137,8 +139,11 @@ def _peak_reset() -> int:
 
 def _children() -> list[str]:
     """The processes that this one started and that run, such as readers of HDF5."""
-    found = [p.read_text("ascii").split() for p in Path("/proc/self/task").glob("*/children")]
-    return [pid for pids in found for pid in pids if _status("VmRSS", pid)]
+    found = []
+    for path in Path("/proc/self/task").glob("*/children"):
+        with suppress(FileNotFoundError):  # the thread has ended
+            found += path.read_text("ascii").split()
+    return [pid for pid in found if _status("VmRSS", pid)]
 
 
 def _status(name: str, process: str = "self") -> int:
@@ -163,4 +168,5 @@ def _say(record: dict[str, Any]) -> None:
 
 if __name__ == "__main__":
     name, seed, first, cases = sys.argv[1:]
-    fuzz(targets()[name], seed=int(seed), first=int(first), cases=int(cases))
+    target = next(target for target in targets() if target.name == name)
+    fuzz(target, seed=int(seed), first=int(first), cases=int(cases))

@@ -93,7 +93,7 @@ def vaes():
     return converted(VAE, theirs, cogvideox_vae.diffusers(VAE)), theirs.double()
 
 
-@pytest.mark.parametrize("frames", [1, 9, 17, 49])
+@pytest.mark.parametrize("frames", [1, 9, 17, 25])
 def test_the_vae_encodes_to_the_moments_of_diffusers(vaes, frames):
     ours, theirs = vaes
     video = np.random.default_rng(0).uniform(-1, 1, (1, frames, 24, 16, 3)).astype(np.float32)
@@ -105,7 +105,7 @@ def test_the_vae_encodes_to_the_moments_of_diffusers(vaes, frames):
         assert relative_error(part, want.permute(0, 2, 3, 4, 1).numpy()) <= TOLERANCE
 
 
-@pytest.mark.parametrize("frames", [1, 3, 5, 13])
+@pytest.mark.parametrize("frames", [1, 3, 5, 7])
 def test_the_vae_decodes_to_the_video_of_diffusers(vaes, frames):
     ours, theirs = vaes
     latents = np.random.default_rng(0).normal(size=(1, frames, 3, 2, 16)).astype(np.float32)

@@ -23,7 +23,7 @@ from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.tables import clip_vision, umt5, wan_dit, wan_vae
 from egosim_jax.diffusion.process import RectifiedFlow
 from egosim_jax.generation.encoding import encode_condition, pack
-from egosim_jax.generation.generator import Generator, denoise
+from egosim_jax.generation.generator import Generator
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
 from egosim_jax.models.wan.dit import WanDiTConfig
 from egosim_jax.models.wan.umt5 import UMT5Config
@@ -45,6 +45,7 @@ CONFIG = ModelConfig(
     process=RectifiedFlow(shift=3.0),
     steps=10,
 )
+encode = jax.jit(encode_condition)
 
 
 @pytest.fixture(scope="module")
@@ -161,8 +162,8 @@ def test_ten_steps_and_the_frames_are_those_of_diffusers(converted, theirs, trip
     inputs = pack([triplet], CONFIG)
     generator = Generator(CONFIG, converted)
     noise = np.asarray(generator.noise([3]))
-    condition = jax.jit(encode_condition)(converted, inputs)
-    ours = jax.jit(lambda net, c, x: denoise(net, c, x, CONFIG))(converted.dit, condition, noise)
+    condition = encode(converted, inputs)
+    ours = generator.latents([triplet], [3])
 
     text, image, _, mean, std = encoded_by_theirs(theirs, inputs)
     channels = np.asarray(CONFIG.layout.condition_channels(condition, condition.prior))
@@ -189,7 +190,7 @@ def test_ten_steps_and_the_frames_are_those_of_diffusers(converted, theirs, trip
 
 def test_the_conditions_are_those_of_diffusers(converted, theirs, triplet):
     inputs = pack([triplet], CONFIG)
-    condition = jax.jit(encode_condition)(converted, inputs)
+    condition = encode(converted, inputs)
     text, image, latents, *_ = encoded_by_theirs(theirs, inputs)
     for have, want in (
         (condition.text, text.numpy()),

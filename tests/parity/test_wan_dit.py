@@ -70,6 +70,9 @@ def reference(channels):
     return model
 
 
+velocity = nnx.jit(lambda network, *inputs: network(*inputs))
+
+
 @pytest.fixture(scope="module", params=[TEXT_TO_VIDEO, IMAGE_TO_VIDEO, EGOSIM])
 def pair(request):
     theirs, config = reference(request.param), config_of(request.param)
@@ -94,10 +97,8 @@ def test_velocity_is_that_of_diffusers_in_float64(pair, time, monkeypatch):
     if config.image_dim is not None:
         image = draw((2, IMAGE_TOKENS, config.image_dim)).astype(np.float32)
     t = np.full(2, time, np.float32)
-    graph, state = nnx.split(ours)
-    velocity = jax.jit(lambda state, *inputs: nnx.merge(graph, state)(*inputs))
     with jax.default_matmul_precision("highest"):
-        have = np.asarray(velocity(state, latents, t, text, image))
+        have = np.asarray(velocity(ours, latents, t, text, image))
     with torch.no_grad():
         want = theirs(
             double(rearrange(latents, "b f h w c -> b c f h w")),

@@ -50,7 +50,7 @@ def test_an_episode_without_ground_truth_is_simulated_but_not_scored(weights, tm
     given = ["--episode", str(tmp_path / "bare")]
     assert simulate(weights, tmp_path / "run", *given, "--clips", "1") == 0
     report = json.loads((tmp_path / "run" / "report.json").read_text("utf-8"))
-    assert report["clips"] == [{"clip": 1, "action": episode.actions[0].prompt}]
+    assert report["clips"] == [{"clip": 1, "action": episode.actions[0].prompt, "notes": []}]
     assert probe_video(tmp_path / "run" / "clip_1_cmp.mp4").width == 3 * 96
     assert (tmp_path / "run" / "contact_sheet.png").exists()
 

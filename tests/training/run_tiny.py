@@ -54,14 +54,18 @@ def training(steps: int, save_every: int) -> TrainConfig:
     )
 
 
-def main(data: str, out: str, steps: str, save_every: str, task: str = "egosim") -> int:
+def fit(data: Path, out: Path, *, steps: int, save_every: int, task: str) -> None:
     """Train, and write the weights."""
+    networks = train(TASKS[task], training(steps, save_every), data=data, validation=None, out=out)
+    weights.save(out / "dit.safetensors", networks.dit)
+
+
+def main(data: str, out: str, steps: str, save_every: str, task: str = "egosim") -> int:
+    """Train as the commands do."""
 
     def run() -> int:
         with training_context():
-            schedule = training(int(steps), int(save_every))
-            networks = train(TASKS[task], schedule, data=Path(data), validation=None, out=Path(out))
-            weights.save(Path(out) / "dit.safetensors", networks.dit)
+            fit(Path(data), Path(out), steps=int(steps), save_every=int(save_every), task=task)
         return ExitCode.DONE
 
     return run_with_exit_codes(run)

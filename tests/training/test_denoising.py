@@ -45,7 +45,7 @@ def test_a_layout_without_a_prior_trains_unless_changes_shall_weigh_more():
     networks = task.networks(nnx.Rngs(0))
     batch = {name: jnp.zeros(s.shape, s.dtype) for name, s in task.shapes(2).items()}
     batch.pop("prior", None)
-    loss, _ = task.loss(networks, batch, task.keys(jax.random.key(0), 2))
+    loss, _ = nnx.jit(task.loss)(networks, batch, task.keys(jax.random.key(0), 2))
     assert np.isfinite(loss)
     with pytest.raises(InputError, match="has no prior"):
         Denoising(model=model, change_loss_weight=1.0)

@@ -5,7 +5,6 @@ import io
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -28,9 +27,13 @@ from egosim_jax.data.records import to_bytes
 from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.io.video import encode_video
 from egosim_jax.io.weights import hashes
+from egosim_jax.runtime.command import ExitCode
 from egosim_jax.train import encode as encoding
+from egosim_jax.train.distributed import free_local_address
 from egosim_jax.train.encode import check_encoders, encode_shards
+from egosim_jax.train.peers import PEER_DIED
 from egosim_jax.types import InputError, VideoSpec
+from tests import flags
 
 pytestmark = pytest.mark.slow
 DEBUG = configs.get("debug")
@@ -322,8 +325,8 @@ def test_shards_that_do_not_name_the_packing_of_their_mask_are_refused(tmp_path)
         check_encoders(tmp_path, CONFIG, None)
 
 
-def test_the_command_goes_on_after_a_kill(weights, tmp_path):
-    """Killed when its first part exists."""
+def test_one_of_two_processes_is_killed_and_one_process_goes_on(weights, tmp_path):
+    """Killed when its first part exists, while the other waits for it or still encodes."""
     clips = write_clips(tmp_path / "clips", DEBUG.video, count=6, frames=13)
     fixed = ["--config", "debug", "--weights", str(weights), "--shards", str(clips)]
 
@@ -331,14 +334,23 @@ def test_the_command_goes_on_after_a_kill(weights, tmp_path):
         return ["data", "encode", *fixed, "--out", str(out), "--shard-windows", "2"]
 
     out = tmp_path / "killed"
-    command = [sys.executable, "-m", "egosim_jax.cli", *arguments(out)]
-    program = subprocess.Popen(command, env=os.environ | {"JAX_PLATFORMS": "cpu"})
-    try:
-        while program.poll() is None and not (out / "parts" / "00000" / MANIFEST).exists():
-            time.sleep(0.01)
-    finally:
-        program.send_signal(signal.SIGKILL)
-        program.wait()
+    shared = {"JAX_COORDINATOR_ADDRESS": free_local_address(), "JAX_NUM_PROCESSES": "2"}
+    other, victim = (
+        subprocess.Popen(
+            [sys.executable, "-m", "egosim_jax.cli", *arguments(out)],
+            env=os.environ | flags.devices(1) | shared | {"JAX_PROCESS_ID": str(index)},
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for index in range(2)
+    )
+    while victim.poll() is None and not (out / "parts" / "00001" / MANIFEST).exists():
+        time.sleep(0.01)
+    victim.kill()
+    said = other.communicate(timeout=60)[1]
+    victim.communicate(timeout=60)
+    assert other.returncode == ExitCode.RESUBMIT, said
+    assert said.rstrip().endswith(PEER_DIED)
     assert not (out / MANIFEST).exists()
     assert main(arguments(out)) == 0
     assert main(arguments(tmp_path / "whole")) == 0

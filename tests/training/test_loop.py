@@ -21,6 +21,8 @@ from egosim_jax.types import InputError, MeshConfig
 from tests.training.killing import logged
 from tests.training.line import POINTS, Line, training, write_points
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 
 @pytest.fixture(scope="module")
 def points(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -46,8 +48,6 @@ def test_the_loss_falls_and_the_time_spent_is_reported(points, tmp_path, capsys)
     said = capsys.readouterr().err
     for phase in ("compiling", "waiting for data", "updates", "validation", "total"):
         assert phase in said
-    assert f"curves, sample clips and settings: {tmp_path / 'index.html'}" in said
-    assert "step 20 of 20" in (tmp_path / "index.html").read_text()
     assert json.loads((tmp_path / "times.json").read_text())["updates"] > 0
 
 
@@ -123,7 +123,7 @@ def test_gradient_accumulation_gives_the_same_run(points, tmp_path):
 
 
 def test_the_ema_follows_its_formula(points, tmp_path):
-    decay, steps = 0.8, 6
+    decay, steps = 0.6, 3
     weights = [
         values(fit(tmp_path / str(n), points, steps=n, save_every=n)).astype(float)
         for n in range(1, steps + 1)

@@ -24,7 +24,10 @@ REPORT = (
 
 
 def start(code: str, **options) -> subprocess.Popen:
-    program = f"import os, sys, time; from egosim_jax.train.peers import run_in_child\n{code}"
+    program = (
+        "import os, sys, time; from egosim_jax.train import peers; peers.HOLD_S = 1.0\n"
+        f"from egosim_jax.train.peers import run_in_child\n{code}"
+    )
     return subprocess.Popen([sys.executable, "-c", program], text=True, **options)
 
 
@@ -33,7 +36,7 @@ def start(code: str, **options) -> subprocess.Popen:
     [
         (f"sys.stderr.write({REPORT!r}); sys.stderr.flush(); os.abort()", 75, f"{PEER_DIED}\n"),
         (
-            f"sys.stderr.write({REPORT!r}); sys.stderr.flush(); time.sleep(7); os.abort()",
+            f"sys.stderr.write({REPORT!r}); sys.stderr.flush(); time.sleep(2); os.abort()",
             75,
             f"{PEER_DIED}\n",
         ),

@@ -20,12 +20,12 @@ ERROR = 2e-5
 """Maximum relative difference of float32 videos, whose sums have another order."""
 
 
-@pytest.fixture
-def narrow(tmp_path):
+@pytest.fixture(scope="module")
+def narrow(tmp_path_factory):
     vae, draw = abstract(NARROW), np.random.default_rng(0)
     shapes = weights.flat_shapes(vae)
     weights.fill(vae, {name: 0.2 * draw.normal(size=shapes[name]) for name in shapes})
-    folder = tmp_path / "narrow"
+    folder = tmp_path_factory.mktemp("narrow")
     weights.save(folder / "vae.safetensors", vae)
     (folder / "text.safetensors").write_bytes(b"text")
     return vae, folder

@@ -46,13 +46,19 @@ def check(out: Path, alone: Path, *, first: int = 1, atol: float = 1e-6) -> None
     for name in have.keys() & {"record", "x"}:
         np.testing.assert_array_equal(have[name][1:], want[name][first:])
     np.testing.assert_allclose(have["weights"], want["weights"], rtol=1e-6, atol=atol)
-    # Accumulated parts of a batch have other `ids`; the records were compared above. The first
-    # process counts only the records that it skipped itself.
+    # Accumulated parts of a batch have other `ids`; the records were compared above. A bad record
+    # is counted when it is read ahead, so earlier or later.
     others = ("ids", "skipped_records")
     logs = [
         [{name: line[name] for name in line if name not in others} for line in logged(folder)]
         for folder in (out, alone)
     ]
+    if first == 1:
+        bad = [
+            [line["skipped_records"] for line in logged(folder) if "skipped_records" in line]
+            for folder in (out, alone)
+        ]
+        assert bad[0][-1:] == bad[1][-1:]
     assert [line.keys() for line in logs[0]] == [line.keys() for line in logs[1]]
     for mine, theirs in zip(*logs, strict=True):
         assert mine == pytest.approx(theirs, rel=1e-6)

@@ -10,9 +10,11 @@ import pytest
 from PIL import Image
 
 from egosim_jax.cli.view import View
+from egosim_jax.train.loop import train
 from egosim_jax.train.run_page import MAX_POINTS, Stage, draw_curves, stages_of, write_page
 from egosim_jax.types import InputError
 from tests.training.finished import write_stage
+from tests.training.line import Line, training, write_points
 
 
 def inline(page: str, kind: str) -> list[bytes]:
@@ -42,6 +44,17 @@ def test_the_page_has_curves_samples_times_and_settings(tmp_path):
         assert f"<tr><th>{name}</th><td>{value}</td></tr>" in page
 
 
+def test_a_training_draws_its_page(tmp_path, capsys):
+    points = write_points(tmp_path / "points")
+    train(Line(), training(steps=3), data=points, validation=points, out=tmp_path / "run")
+    page = (tmp_path / "run" / "index.html").read_text()
+    assert "step 3 of 3" in page
+    (curves,) = inline(page, r"image/svg\+xml")
+    assert curves.count(b'id="axes_') >= 3
+    said = capsys.readouterr().err
+    assert f"curves, sample clips and settings: {tmp_path / 'run' / 'index.html'}" in said
+
+
 def test_the_page_loads_nothing_and_escapes_every_text(tmp_path):
     page = write_page(write_stage(tmp_path / "<b>run", samples=(40,))).read_text()
     assert "default-src 'none'" in page
@@ -50,6 +63,7 @@ def test_the_page_loads_nothing_and_escapes_every_text(tmp_path):
     assert "&lt;b&gt;run" in page
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_stages_are_in_the_order_of_the_recipe(tmp_path):
     for name in ("denoiser", "vae"):
         write_stage(tmp_path / name)
@@ -119,7 +133,12 @@ HOSTILE_METRICS = {
 }
 
 
-@pytest.mark.parametrize("kind", HOSTILE_METRICS)
+SLOW = {"many": pytest.mark.slow}
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=SLOW.get(kind, ())) for kind in HOSTILE_METRICS]
+)
 def test_a_page_is_made_of_any_metrics(tmp_path, kind):
     run = write_stage(tmp_path / "run")
     lines = [json.dumps({"step": step} | HOSTILE_METRICS[kind]) for step in (1, 2)]
@@ -136,6 +155,7 @@ def deep(depth: int) -> str:
     return '{"a":' * depth + "1" + "}" * depth
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     ("name", "text"),
     [
@@ -162,6 +182,7 @@ def bomb() -> bytes:
     return data.getvalue()
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     "data",
     [b"", b"no image", bomb(), b"\x89PNG\r\n\x1a\n" + bytes(99)],
@@ -175,6 +196,7 @@ def test_an_image_that_cannot_be_shown_is_named(tmp_path, data):
     assert len(inline(page, "image/jpeg")) == 1
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     "name",
     ["samples/step_000040.mp4", "samples/step_000040.png", "times.json", "environment.json"],
@@ -189,6 +211,7 @@ def test_a_link_out_of_the_run_is_not_embedded(tmp_path, name):
     assert shown == write_page(run).read_text()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_stage_or_folder_of_samples_that_is_a_link_is_not_shown(tmp_path):
     other = write_stage(tmp_path / "other", samples=(40,))
     run = write_stage(tmp_path / "run" / "own")
@@ -198,6 +221,7 @@ def test_a_stage_or_folder_of_samples_that_is_a_link_is_not_shown(tmp_path):
     assert "data:video" not in write_page(tmp_path / "run").read_text()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_names_that_are_no_text_are_shown_escaped(tmp_path):
     run = write_stage(tmp_path / "run\udcff", samples=(40,))
     image = run / "samples" / "step_000040.png"

@@ -73,7 +73,12 @@ def load_backend(
     batcher = Batcher(generator, max_batch=max(batch, unit), unit=unit)
     for size in batcher.sizes if compile else ():
         generator.compile(size)
-    return GeneratedWorld(generator=batcher, video=model.video, perception=perception)
+    return GeneratedWorld(
+        generator=batcher,
+        video=model.video,
+        perception=perception,
+        trained_on=configs.trained_on(config, folder),
+    )
 
 
 def make(*, backend: Backend | None = None, world: World = "generated", **options: Any) -> WorldEnv:

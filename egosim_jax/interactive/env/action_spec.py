@@ -35,6 +35,8 @@ HAND_NAMES = ("x", "y", "z", "rx", "ry", "rz", "closure")
 CAMERA_NAMES = ("camera x", "camera y", "camera z", "camera rx", "camera ry", "camera rz")
 REST = (0.15, 0.02, 0.16, -0.5, 0.0, 0.4, 0.25)
 """Resting right hand: position in meters, rotation vector in radians, closure."""
+REST_MARGIN = 0.05
+"""Minimum distance of a resting row to each bound, as a fraction of the range."""
 
 
 def to_numbers(rows: object) -> Float[np.ndarray, ...]:
@@ -63,7 +65,7 @@ class ActionSpec:
     camera: bool = False
     """Append the camera pose to each row; without it the camera does not move."""
     workspace_m: tuple[tuple[float, float, float], tuple[float, float, float]] = (
-        (-0.35, 0.0, 0.0),
+        (-0.35, -0.03, 0.0),
         (0.35, 0.55, 0.40),
     )
     """Minimum and maximum position of a wrist or joint in the world, in meters."""
@@ -124,16 +126,15 @@ class ActionSpec:
 
     @cached_property
     def rest(self) -> Float[np.ndarray, " d"]:
-        """Row of resting hands in front of the wearer, within the workspace."""
+        """Row of resting hands in front of the wearer, with a margin to the bounds."""
         row: list[float] = []
-        low, high = np.array(self.workspace_m)
         for side in self.sides:
             mirror = np.array([-1, 1, 1, 1, -1, -1, 1]) if side == "left" else 1
             hand = np.array(REST) * mirror
-            hand[:3] = np.clip(hand[:3], low, high)
+            hand[:3] = _inside(hand[:3], *np.array(self.workspace_m))
             keypoints = self.layout == "keypoints"
             row += self._placed(hand, side).ravel().tolist() if keypoints else hand.tolist()
-        return np.clip([*row, *([0.0] * 6 if self.camera else [])], *self.bounds)
+        return _inside(np.array([*row, *([0.0] * 6 if self.camera else [])]), *self.bounds)
 
     def check(self, rows: object, *, max_rows: int) -> Float[np.ndarray, "k d"]:
         """Return 1 to `max_rows` rows as an array.
@@ -252,6 +253,14 @@ class ActionSpec:
             "camera_reach": tuple(map(float, reach)),
         }
         return cls(**values)
+
+
+def _inside(
+    values: Float[np.ndarray, " d"], low: Float[np.ndarray, " d"], high: Float[np.ndarray, " d"]
+) -> Float[np.ndarray, " d"]:
+    """Return values with a margin to their bounds: a policy's noise must not leave them at once."""
+    margin = REST_MARGIN * (high - low)
+    return np.clip(values, low + margin, high - margin)
 
 
 def _shape(value: Any) -> tuple[int, ...] | None:

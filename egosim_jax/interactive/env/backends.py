@@ -24,6 +24,11 @@ class Backend(Protocol):
         """Length, size and rate of the clips."""
         ...
 
+    @property
+    def trained_on(self) -> str | None:
+        """Simulated world whose clips trained the model; None if unknown or without a model."""
+        ...
+
     needs_past: ClassVar[bool]
     """True if a simulator depends on all actions since the seed."""
 
@@ -50,6 +55,8 @@ class GeneratedWorld:
     """Length, size and rate of the generator's clips."""
     perception: str | None = "classical"
     """Perception that updates the state: name and options, or None to keep the first state."""
+    trained_on: str | None = None
+    """Simulated world whose clips trained the generator (`configs.trained_on`); None if unknown."""
 
     needs_past: ClassVar[bool] = False
 
@@ -81,15 +88,21 @@ class GeneratedWorld:
 
 
 def tabletop_start(seed: int, spec: ActionSpec, video: VideoSpec) -> Start:
-    """Return the start of a seed's tabletop scene."""
+    """Return the start of a seed's tabletop scene, with the neutral prompt."""
     check_seed(seed, name="seed")
     _, camera, first, state = start_of_sequence(seed, spec=video, kind=spec.kind)
-    name = next(iter(state.names.values()))
-    who = "The gripper" if spec.kind == "robot" else f"The {spec.sides[0]} hand"
     return Start(
         state=state,
         camera=camera,
-        prompt=f"{who} picks up the {name} and puts it down to the left.",
+        prompt=neutral_prompt(spec),
         seed=seed,
         first_frame=first.colors,
     )
+
+
+def neutral_prompt(spec: ActionSpec) -> str:
+    """Return a prompt that names no object and no goal: the policy alone decides what happens."""
+    side, *others = spec.sides
+    if spec.kind == "robot":
+        return "The grippers move." if others else "The gripper moves."
+    return "The hands move." if others else f"The {side} hand moves."

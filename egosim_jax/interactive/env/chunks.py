@@ -10,25 +10,20 @@ import time
 from dataclasses import dataclass, field, replace
 from typing import Any, no_type_check
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.batching import announced
-from egosim_jax.rendering import Renderer
 from egosim_jax.simulation.actions import check_action
 from egosim_jax.simulation.simulator import Simulator, Step
 from egosim_jax.simulation.start import Start
+from egosim_jax.state import snapshot
 from egosim_jax.types import Action, Cameras, SceneState, VideoSpec, View
 
 OBSERVATIONS = ("frames", "depth", "keypoints", "state")
 STATE_FIELDS = ("points_m", "colors", "object_ids")
 """Arrays of the observation `state`."""
-STEADY_LEVELS = 25
-"""Maximum color difference (0 to 255) of a pixel that agrees with the state."""
-HAND_MARGIN = 0.08
-"""Margin around a hand's skeleton in which pixels may change, as a fraction of the image width."""
 
 
 @no_type_check
@@ -113,39 +108,38 @@ def timed_step(
         rendered = time.monotonic()
         clip = simulator.generate(view, action, seed=seed, first_frame=first_frame)
     generated = time.monotonic()
-    after = simulator.update(state, clip, action)
+    after, notes = simulator.update(state, clip, action)
     timing = Timing(
         render_s=rendered - then,
         generate_s=generated - rendered,
         update_s=time.monotonic() - generated,
     )
-    return Step(view=view, clip=clip, state=after), timing
+    return Step(view=view, clip=clip, state=after, notes=notes), timing
+
+
+def state_info(state: SceneState) -> dict[str, Any]:
+    """Return the hash of a state, and the name and pose of each object, by id."""
+    return {
+        "state_sha256": snapshot.fingerprint(state),
+        "objects": dict(state.names),
+        "object_poses": object_poses(state),
+    }
+
+
+def object_poses(state: SceneState) -> dict[int, Float[np.ndarray, "4 4"]]:
+    """Return the pose of each object in the world, by id.
+
+    The translation is the center of the object's points. The rotation is relative to the state in
+    which the object was first observed.
+    """
+    poses = {}
+    for number in np.unique(state.object_ids[state.object_ids > 0]).tolist():
+        pose = np.array(state.world_from_object.get(number, np.eye(4)), float)
+        pose[:3, 3] = state.points_m[state.object_ids == number].mean(axis=0, dtype=float)
+        poses[number] = pose
+    return poses
 
 
 def view_of(simulator: Simulator, state: SceneState, cameras: Cameras) -> View:
     """Return the view of a state along a camera path, as the simulator renders it."""
     return simulator.renderer.render(state, cameras, point_px=simulator.point_px)
-
-
-def validity(step: Step, action: Action, renderer: Renderer) -> float:
-    """Return the fraction of steady pixels whose color agrees with the state, from 0 to 1.
-
-    Steady pixels show observed background, away from hands and objects. NaN without any.
-    """
-    hands = renderer.draw_hands(action.joints_m, action.cameras, kind=action.kind)[1]
-    steady = steady_pixels(step.view, np.isfinite(hands))
-    if not steady.any():
-        return float("nan")
-    gaps = np.abs(step.clip.frames.astype(np.int16) - step.view.frames).max(axis=-1)
-    return float((gaps[steady] <= STEADY_LEVELS).mean())
-
-
-def steady_pixels(view: View, hands: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
-    """Return the mask of pixels of a view in which nothing should move."""
-    reach = 2 * round(HAND_MARGIN * view.mask.shape[2]) + 1
-    near = np.ones((reach, reach), np.uint8)
-    moving = [
-        cv2.dilate(((ids != 0) | hand).astype(np.uint8), near)
-        for ids, hand in zip(view.object_ids, hands, strict=True)
-    ]
-    return (view.mask == 0) & (np.stack(moving) == 0)

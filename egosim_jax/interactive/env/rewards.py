@@ -8,6 +8,7 @@ from typing import Protocol, no_type_check, runtime_checkable
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from egosim_jax.io.bounded import quote
 from egosim_jax.simulation.simulator import Step
 from egosim_jax.simulation.start import Start
 from egosim_jax.types import InputError, SceneState, check_video
@@ -83,6 +84,7 @@ def no_reward(outcome: Outcome) -> Reward:
     return Reward(reward=0.0)
 
 
+@no_type_check
 @dataclass(frozen=True, kw_only=True)
 class MoveObject:
     """Task of moving an object by an offset; success is exact in the true world."""
@@ -93,6 +95,26 @@ class MoveObject:
     """Target displacement in the world, in meters."""
     tolerance_m: float = 0.02
     """Maximum distance to the goal that counts as success, in meters."""
+
+    def __post_init__(self) -> None:
+        """Raise `InputError` unless id, offset and tolerance are numbers that a task can have."""
+        if isinstance(self.number, bool) or not isinstance(self.number, int | np.integer):
+            raise InputError(
+                f"The object is {quote(self.number)}: it must be an id, a whole number. Choose one "
+                "of the keys of info['objects']. (number)"
+            )
+        offset = np.asarray(self.offset_m)
+        numbers = offset.shape == (3,) and offset.dtype.kind in "iuf"
+        if not (numbers and np.isfinite(offset).all()):
+            raise InputError(
+                f"The offset is {quote(self.offset_m)}: it must be x, y and z in meters, all "
+                "finite. (offset_m)"
+            )
+        if not 0 < self.tolerance_m < np.inf:
+            raise InputError(
+                f"The tolerance is {quote(self.tolerance_m)}: it must be above 0, in meters. "
+                "(tolerance_m)"
+            )
 
     def check(self, start: Start) -> None:
         """Raise `InputError` unless the state has points of the object."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from jaxtyping import Float, UInt8
 
+from egosim_jax import configs
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import Backend
 from egosim_jax.interactive.env.chunks import (
@@ -21,12 +23,13 @@ from egosim_jax.interactive.env.chunks import (
     Chunk,
     last_camera,
     make_chunk,
+    state_info,
     straight_path,
     timed_step,
-    validity,
     view_of,
 )
 from egosim_jax.interactive.env.rewards import Outcome, RewardFn, check_reward, no_reward
+from egosim_jax.interactive.env.validity import validity
 from egosim_jax.io.bounded import quote
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.simulation.simulator import Step
@@ -144,6 +147,8 @@ class RunningEpisode:
         self.backend, self.actions, self.start, self.now = backend, actions, start, start
         self.camera = start.camera
         self.last: Step | None = None
+        if note := configs.scene_warning(backend.trained_on, start.state.provenance):
+            warnings.warn(note, stacklevel=3)
 
     @property
     def row(self) -> Float[np.ndarray, " d"]:
@@ -176,7 +181,8 @@ class RunningEpisode:
         )
         return step, {
             **chunk.info(self.actions),
-            "validity": validity(step, action, simulator.renderer),
+            "notes": list(step.notes),
+            **validity(now.state, step, action, simulator.renderer),
             "timing": timing,
         }
 
@@ -188,13 +194,8 @@ class RunningEpisode:
         return self.info()
 
     def info(self) -> dict[str, Any]:
-        """Return the number of the last chunk, the hash of the state, and the object names."""
-        state = self.now.state
-        return {
-            "chunk": self.chunks,
-            "state_sha256": snapshot.fingerprint(state),
-            "objects": dict(state.names),
-        }
+        """Return the number of the last chunk, the hash of the state, and its objects."""
+        return {"chunk": self.chunks, **state_info(self.now.state)}
 
     def frames(self) -> UInt8[np.ndarray, "f h w 3"]:
         """Return the frames of the last chunk; before the first chunk, the first frame repeated."""
@@ -287,8 +288,8 @@ class WorldEnv(gymnasium.Env):
     ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Simulate 1 to `chunk` rows, one per frame, and hold the last row until the chunk ends.
 
-        `info` has the chunk number, padded frames, hidden hands, hash of the state, seconds of each
-        phase, `validity` and `success`.
+        `info` has the chunk number, padded frames, hidden hands, hash of the state, names and poses
+        of the objects, seconds of each phase, `validity`, `object_validity` and `success`.
         """
         self._check_open()
         running = self.running

@@ -52,6 +52,11 @@ class TrueWorld:
         default_factory=OrderedDict, init=False, repr=False, compare=False
     )
 
+    @property
+    def trained_on(self) -> None:
+        """Return None: this world has no model."""
+        return None
+
     def identity(self) -> dict[str, str]:
         """Return the size of the clips; nothing else varies."""
         return {"world": "true", "video": str(self.video)}

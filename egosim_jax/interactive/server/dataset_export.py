@@ -10,12 +10,12 @@ from typing import Any
 from egosim_jax.data.lerobot_writer import ClipRecord, EpisodeRecord, write_lerobot
 from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.shards import ShardWriter
+from egosim_jax.geometry import up_of
 from egosim_jax.interactive.env.backends import GeneratedWorld
 from egosim_jax.interactive.env.chunks import view_of
 from egosim_jax.interactive.server.session import CLOSED, DAMAGE, SETTINGS, Session, settings_of
 from egosim_jax.io.bounded import quote_path
 from egosim_jax.rendering import get
-from egosim_jax.rendering.portrait import up_of
 from egosim_jax.rendering.rerun_log import Recording
 from egosim_jax.types import Action, InputError, SceneState, Triplet, VideoGrid, VideoSpec, View
 

@@ -27,10 +27,13 @@ from typing import Any, no_type_check
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from egosim_jax import configs
 from egosim_jax.interactive.env.action_spec import ActionSpec, to_numbers
 from egosim_jax.interactive.env.backends import Backend
 from egosim_jax.interactive.env.batching import announced
-from egosim_jax.interactive.env.chunks import Chunk, last_camera, make_chunk, validity, view_of
+from egosim_jax.interactive.env.chunks import Chunk, last_camera, make_chunk, state_info, view_of
+from egosim_jax.interactive.env.validity import validity
+from egosim_jax.interactive.server import wire
 from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.io.bounded import quote, quote_path, read_json
 from egosim_jax.io.digest import fingerprint
@@ -158,18 +161,21 @@ class Session:
         simulator, image = self.backend.simulator(start), start.first_frame
         if image is None:
             image = view_of(simulator, start.state, start.camera).frames[0]
+        info = self._state_info(start.state, self.committed)
+        if note := configs.scene_warning(self.backend.trained_on, start.state.provenance):
+            info["scene_warning"] = note
         return Result(
             step_id=self.committed,
             frames=image[None],
             state=start.state,
             row=self.actions.rest if start.row is None else start.row,
             camera=start.camera,
-            info=self._state_info(start.state, self.committed),
+            info=info,
         )
 
     def _state_info(self, state: SceneState, number: int) -> dict[str, Any]:
-        names = {str(key): name for key, name in state.names.items()}
-        return {"chunk": number, "state_sha256": snapshot.fingerprint(state), "objects": names}
+        """Return the metadata of a state in the form in which JSON keeps it."""
+        return {"chunk": number, **wire.to_json(state_info(state))}
 
     def action(self, number: int) -> Action:
         """Return the action of an accepted step."""
@@ -290,7 +296,8 @@ class Session:
             **self._state_info(step.state, number),
             "padded_frames": request["padded_frames"],
             "hidden_hands": request["hidden_hands"],
-            "validity": validity(step, action, simulator.renderer),
+            "notes": list(step.notes),
+            **wire.to_json(validity(now.state, step, action, simulator.renderer)),
         }
         row = np.array(request["rows"][-1], float)
         write_json(folder / INFO, info)

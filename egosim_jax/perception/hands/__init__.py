@@ -4,9 +4,10 @@ Drawing of hands is in `silhouettes` and `rendering`.
 
     LandmarkHands:  the estimator, by MediaPipe's networks
     lift:           metric joints in the camera from hand tracks
+    steady:         lifted hands of constant size
 """
 
 from egosim_jax.perception.hands.estimator import LandmarkHands
-from egosim_jax.perception.hands.lift import lift
+from egosim_jax.perception.hands.lift import lift, steady
 
-__all__ = ["LandmarkHands", "lift"]
+__all__ = ["LandmarkHands", "lift", "steady"]

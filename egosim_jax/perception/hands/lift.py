@@ -8,10 +8,17 @@ that depth, so a drawn skeleton coincides with the observed hand.
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 from jaxtyping import Float
 
 from egosim_jax.perception.estimates import HandTracks
+
+PALM_BONES = np.array([(0, 5), (0, 9), (0, 13), (0, 17), (5, 17)])
+"""Pairs of joints whose distance stays equal in a hand."""
+SMOOTH_S = 0.12
+"""Standard deviation of the smoothing of depth over time, in seconds."""
 
 
 def lift(
@@ -34,6 +41,29 @@ def lift(
     depth[(depth <= 0).any(-1)] = np.nan
     joints_m[found] = rays[found] * depth[..., None]
     return joints_m
+
+
+def steady(joints_m: Float[np.ndarray, "f n 21 3"], fps: Fraction) -> Float[np.ndarray, "f n 21 3"]:
+    """Return lifted hands of constant size whose depth changes smoothly.
+
+    The size of a lifted hand, and with it the depth, has an error that changes from frame to frame.
+    Keypoints stay on their rays.
+    """
+    result = joints_m.copy()
+    for hand in range(joints_m.shape[1]):
+        known = np.flatnonzero(np.isfinite(joints_m[:, hand]).all(axis=(1, 2)))
+        if not len(known):
+            continue
+        joints = joints_m[known, hand]
+        start, end = joints[:, PALM_BONES].transpose(2, 0, 1, 3)
+        lengths = np.linalg.norm(end - start, axis=-1)
+        size = np.median(lengths / np.median(lengths, axis=0), axis=1)
+        depth = joints[:, np.unique(PALM_BONES), 2].mean(axis=1)
+        apart_s = (known[:, None] - known) / float(fps)
+        weights = np.exp(-0.5 * (apart_s / SMOOTH_S) ** 2)
+        smooth = np.exp(weights @ np.log(depth / size) / weights.sum(axis=1))
+        result[known, hand] *= (smooth / depth)[:, None, None]
+    return result
 
 
 def _depths(

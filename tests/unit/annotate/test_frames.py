@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from egosim_jax.annotate.frames import Sampling, plan, read_frames
+from egosim_jax.annotate.frames import Sampling, plan, read_frames, read_searched_frames
 from egosim_jax.data.recording import Recording
 from egosim_jax.geometry import project
 from egosim_jax.types import InputError
@@ -97,3 +97,32 @@ def test_frames_are_cropped_in_the_middle(tmp_path):
     assert (fitted.height, fitted.width) == (48, 80)
     assert fitted.scale == pytest.approx(80 / 90)
     assert read_frames(recording, fitted, 0, 9).shape == (9, 48, 80, 3)
+
+
+@pytest.mark.parametrize("size", [(480, 832), (464, 832), (256, 448)])
+def test_pixels_of_the_video_are_where_the_frame_is_resized_and_cropped(size):
+    fitted = plan(replace(FULL_HD, height=1070), Sampling(size=size), cut=False)
+    row, column = np.mgrid[:1070, :1920].astype(np.float32)
+    clip = np.stack([fitted.fit(column), fitted.fit(row)], axis=-1)  # where each pixel is from
+    there = fitted.pixels(clip.astype(float), (1070, 1920))
+    row, column = np.mgrid[: size[0], : size[1]]
+    inner = np.s_[2:-2, 2:-2]
+    np.testing.assert_allclose(there[..., 0][inner], column[inner], atol=0.02)
+    np.testing.assert_allclose(there[..., 1][inner], row[inner], atol=0.02)
+    half = fitted.pixels((clip + 0.5) / 2 - 0.5, (535, 960))
+    np.testing.assert_allclose(half, there, atol=1e-4)
+
+
+def test_hands_are_searched_in_the_frames_of_the_video(tmp_path):
+    video = textured_video(9, 60, 90)
+    path = write(tmp_path / "a.mp4", video)
+    recording = Recording(
+        recording_id="a", video=path, frames=9, fps=Fraction(16), height=60, width=90
+    )
+    smaller = plan(recording, Sampling(size=(32, 48)), cut=False)
+    found = read_searched_frames(recording, np.array([1, 4]), smaller)
+    assert found is not None
+    assert found.shape == (2, 60, 90, 3)
+    assert np.abs(found[1].astype(int) - video[4]).mean() < 5
+    same = plan(replace(recording, height=48, width=80), Sampling(), cut=False)
+    assert read_searched_frames(recording, np.array([1, 4]), same) is None

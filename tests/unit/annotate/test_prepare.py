@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from egosim_jax.annotate.frames import Sampling, plan
-from egosim_jax.annotate.prepare import Cutting, Quality, scan, windows
+from egosim_jax.annotate.prepare import Cutting, Quality, differs, scan, windows
 from egosim_jax.annotate.sources import find_sources, open_source
 from egosim_jax.types import InputError
 from tests.unit.annotate.stubs import textured_video, write
@@ -49,12 +49,18 @@ def test_black_frames_belong_to_no_clip(tmp_path):
     assert [(w.start, w.refused) for w in cut] == [(0, None), (25, None)]
 
 
+def noisy(image):
+    noise = np.random.default_rng(0).normal(0, 8, (17, *image.shape))
+    return np.clip(image + noise, 0, 255).astype(np.uint8)
+
+
 @pytest.mark.parametrize(
     ("frames", "rule"),
     [
         (np.full((17, 48, 80, 3), 2, np.uint8), "black"),
         (np.full((17, 48, 80, 3), 120, np.uint8), "blur"),
         (np.repeat(textured_video(1), 17, axis=0), "still"),
+        (noisy(textured_video(1)[0]), "still"),
     ],
 )
 def test_bad_clips_are_refused_with_rule_and_figure(tmp_path, frames, rule):
@@ -62,6 +68,18 @@ def test_bad_clips_are_refused_with_rule_and_figure(tmp_path, frames, rule):
     assert window.refused is not None
     assert window.refused[0] == rule
     assert "(--m" in window.refused[1]
+
+
+@pytest.mark.parametrize("fps", [8, 30])
+def test_noise_is_no_motion(fps):
+    rng = np.random.default_rng(0)
+    image, lag = rng.uniform(40, 210, (18, 32)), fps // 2
+    for noise in (0.3, 0.8, 2.0):
+        a, b, c = image + rng.normal(0, noise, (3, 18, 32))
+        assert not differs(a, b, c)
+    shifted = [np.roll(image, 1, axis=1) * k / lag + image * (1 - k / lag) for k in range(lag + 1)]
+    noisy = [frame + rng.normal(0, 0.3, image.shape) for frame in shifted]
+    assert differs(noisy[0], noisy[-2], noisy[-1])
 
 
 def test_thresholds_can_be_switched_off(tmp_path):

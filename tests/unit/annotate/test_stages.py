@@ -7,11 +7,27 @@ import numpy as np
 import pytest
 
 from egosim_jax.annotate.clip import Job, open_record
+from egosim_jax.annotate.frames import Sampling
 from egosim_jax.annotate.prepare import RefusedError
-from egosim_jax.annotate.scene import STAGES, check_prior, to_triplet
+from egosim_jax.annotate.scene import (
+    STAGES,
+    check_prior,
+    clean_first_frame,
+    find_moved_objects,
+    join_objects,
+    plane_behind_objects,
+    to_triplet,
+)
 from egosim_jax.annotate.sources import Source, open_source
-from egosim_jax.annotate.stages import drop_flashes, find_hands, hold_hands, visible
+from egosim_jax.annotate.stages import (
+    drop_flashes,
+    find_hands,
+    hold_hands,
+    search_hands,
+    visible,
+)
 from egosim_jax.perception.estimates import LEFT, RIGHT
+from egosim_jax.perception.moved import Moved
 from tests.unit.annotate.stubs import StubHands, config, textured_video, write
 
 
@@ -48,8 +64,60 @@ def test_a_prior_that_is_worse_than_the_first_frame_is_refused():
     figures = {"psnr_background": 17.0, "psnr_first_frame": 20.0}
     with pytest.raises(RefusedError, match=r"-3\.0 dB .*\(--min-prior-gain\)"):
         check_prior("incremental", figures, config())
-    check_prior("static", figures, config())
     check_prior("incremental", {**figures, "psnr_background": 19.0}, config())
+
+
+@pytest.mark.parametrize("rung", ["static", "rotation"])
+def test_the_prior_of_a_fixed_camera_is_checked_too(rung):
+    exact, coarse = {"psnr_drawn": 100.0}, {"psnr_drawn": 27.5}
+    wrong = {"psnr_background": 27.0, "psnr_first_frame": 30.0}
+    with pytest.raises(RefusedError, match=r"-3\.0 dB .*\(--min-prior-gain\)"):
+        check_prior(rung, wrong | exact, config())
+    check_prior(rung, wrong | coarse, config())  # as well as the points can draw it
+    changing = {"psnr_background": 12.0, "psnr_first_frame": 12.0} | exact
+    with pytest.raises(RefusedError, match=r"12\.0 dB, below 16 dB.*a screen.*--rung"):
+        check_prior(rung, changing, config())
+    check_prior("incremental", changing, config())
+
+
+def test_moved_objects_are_joined_by_other_objects():
+    ids, standing = np.zeros((2, 8, 8), np.int32)
+    ids[2:5, 2:5] = 3
+    standing[1:5, 2:5] = 1
+    standing[6:, :4] = 2
+    joined, names = join_objects(ids, {3: "moved object"}, standing)
+    assert (joined[1:5, 2:5] == 3).all()
+    assert (joined[6:, :4] == 4).all()
+    assert names == {3: "moved object", 4: "object 4"}
+    assert np.count_nonzero(joined) == 20
+
+
+def test_moved_objects_get_ids_and_sleeves_are_arms(tmp_path, monkeypatch):
+    record = stages_of(tmp_path, config(segment=True), last="scale")
+    shown = np.zeros((3, 9, 48, 80), bool)
+    shown[0, :, 9:21, 58:68] = True  # on the cup of the network
+    shown[1, :, 30:40, 30:40] = True
+    shown[2, :, 40:48, 0:20] = True
+    found = [
+        Moved(first=mask[0], shown=mask, motion_px=np.zeros((9, 2, 3)), contacts=(), worn=n == 2)
+        for n, mask in enumerate(shown)
+    ]
+    monkeypatch.setattr("egosim_jax.perception.moved.find_moved", lambda *_: found)
+    settings = config()
+    record = find_moved_objects(record, settings.build(), settings)
+    ids = record.require("object_ids")
+    assert ids[4, 15, 65] == ids[4, 9, 58] == 5
+    assert (ids[4, 35, 35], ids[4, 45, 10]) == (6, -1)
+    assert record.names == {5: "cup", 6: "moved object"}
+    assert record.require("moved_ids").tolist() == [5, 6]
+    assert (record.moved == np.isin(ids, [5, 6])).all()
+    plane = replace(record.require("depth"), confident=np.zeros((1, 48, 80), bool))
+    depth_m = plane_behind_objects(replace(record, depth=plane)).depth_m[0]
+    assert (depth_m[record.moved[0]] == plane.depth_m[0, 0, 0]).all()
+    assert np.unique(depth_m[~record.moved[0]]) == pytest.approx(plane.depth_m[0, 0, 0] * 1.24)
+    assert plane_behind_objects(record) is record.depth  # measured
+    record = clean_first_frame(record, settings.build(), settings)
+    assert (record.require("first_frame")[35, 35] == record.frames[0, 35, 35]).all()
 
 
 def test_a_second_hand_for_a_moment_is_the_first_one_again():
@@ -65,6 +133,22 @@ def test_a_second_hand_for_a_moment_is_the_first_one_again():
     assert visible(kept)[:, RIGHT].all()
     alone = StubHands(0.05, None)(np.zeros((60, 48, 80, 3), np.uint8))
     assert visible(drop_flashes(alone, Fraction(16))).sum() == 3
+
+
+def test_hands_outside_of_the_crop_are_missing_and_others_in_pixels_of_the_clip(tmp_path):
+    recording = open_source(Source(name="cup", path=write(
+        tmp_path / "cup.mp4", textured_video(9, 96, 160)
+    )))  # fmt: skip
+    recording.save(tmp_path / "cup")
+    settings = config(sampling=Sampling(size=(48, 64)))
+    job = Job(video_id="cup", recording=str(tmp_path / "cup"), start=0, stop=9, figures={})
+    record, parts = open_record(job, settings), settings.build()
+    found = search_hands(record, parts)
+    searched = parts.hands(np.zeros((9, 96, 160, 3), np.uint8))
+    half = (searched.joints_px + 0.5) / 2 - 0.5 - [8, 0]  # 80 x 48, cropped to 64 columns
+    np.testing.assert_allclose(found.joints_px, half)
+    aside = replace(searched, joints_px=searched.joints_px + [90, 0])
+    assert not visible(search_hands(record, replace(parts, hands=lambda frames: aside))).any()
 
 
 def test_all_hands_are_of_the_given_side(tmp_path):

@@ -21,13 +21,19 @@ from egosim_jax.runtime.command import ExitCode
 from egosim_jax.types import InputError
 
 
-@pytest.fixture(autouse=True)
-def network(monkeypatch):
-    """Use a small network for LPIPS."""
+@pytest.fixture(scope="module")
+def network():
+    """A small network for LPIPS, which is compiled once."""
     stage = (lpips.Convolution(features=4),)
     alex = dataclasses.replace(lpips.CONFIGS["alex"], stages=(stage,) * 5)
-    found = lpips.Lpips(alex, rngs=nnx.Rngs(0))
-    monkeypatch.setattr(lpips, "load_if_installed", lambda name: found if name == "alex" else None)
+    return lpips.Lpips(alex, rngs=nnx.Rngs(0))
+
+
+@pytest.fixture(autouse=True)
+def installed(network, monkeypatch):
+    """Let commands find the network."""
+    known = {"alex": network}
+    monkeypatch.setattr(lpips, "load_if_installed", known.get)
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
 from egosim_jax.generation.generator import Generator
 from egosim_jax.io import weights
+from egosim_jax.io.run import write_json
 from egosim_jax.train import recipes
 from egosim_jax.types import InputError
 
@@ -88,6 +89,35 @@ def test_a_run_given_as_weights_is_named_with_its_folder(debug_weights, tmp_path
     with pytest.raises(InputError, match=r"run is a run: its weights are in .*run/weights\. \("):
         configs.weights_of("debug", tmp_path / "run")
     assert configs.weights_of("debug", tmp_path / "run" / "weights")
+
+
+def test_weights_of_the_tabletop_world_are_known_by_their_folder(debug_weights, tmp_path):
+    assert configs.trained_on("tabletop", configs.shipped_weights("tabletop")) == "tabletop"
+    assert configs.trained_on("debug", debug_weights) is None
+    run = tmp_path / "run" / "weights"
+    run.mkdir(parents=True)
+    for written, known in (
+        ({"type": type(recipes.get("tabletop")).__name__}, "tabletop"),
+        ({"type": type(recipes.get("real_tiny")).__name__}, None),
+        ([], None),
+    ):
+        write_json(run.parent / "config.json", written)
+        assert configs.trained_on("tabletop", run) == known
+    (run.parent / "config.json").write_text("{")
+    assert configs.trained_on("tabletop", run) is None
+
+
+def test_a_scene_that_weights_were_not_made_for_is_said_in_one_line():
+    for world, provenance in (
+        (None, {}),
+        (None, {"world": "tabletop"}),
+        ("tabletop", {"world": "tabletop", "seed": "3"}),
+    ):
+        assert configs.scene_warning(world, provenance) is None
+    note = configs.scene_warning("tabletop", {"source": "depth image"})
+    assert "\n" not in note
+    for command in ("egosim models fetch egosim_14b", "egosim train real_tiny --metadata"):
+        assert command in note
 
 
 @pytest.mark.parametrize("has", [[], ["vae"], ["lora"]])

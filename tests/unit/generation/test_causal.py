@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
@@ -33,16 +34,17 @@ STUDENT = replace(
 def condition(batch):
     """Return the conditions of clips."""
     rng = np.random.default_rng(0)
-    draw = lambda *shape: rng.standard_normal((batch, *shape)).astype(np.float32)  # noqa: E731
+    draw = lambda *shape: jnp.asarray(rng.standard_normal((batch, *shape)), jnp.float32)  # noqa: E731
     video = (3, 4, 4)
     return Condition(
-        mask=(draw(*video, 4) > 0).astype(np.float32), prior=draw(*video, 16),
+        mask=jnp.float32(draw(*video, 4) > 0), prior=draw(*video, 16),
         hands=draw(*video, 16), text=draw(5, 64), image=draw(3, 32),
     )  # fmt: skip
 
 
 def noise(batch):
-    return np.random.default_rng(1).standard_normal((batch, 3, 4, 4, 16)).astype(np.float32)
+    drawn = np.random.default_rng(1).standard_normal((batch, 3, 4, 4, 16))
+    return jnp.asarray(drawn, jnp.float32)
 
 
 def given(batch):

@@ -4,9 +4,11 @@ import dataclasses
 import importlib
 import os
 import random
+import shutil
 import subprocess
 import sys
 import types
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -248,43 +250,55 @@ print(events.count("/jax/compilation_cache/cache_hits"))
 """
 
 
-@pytest.fixture
-def with_jax(tmp_path):
+def run_with_jax(home: Path, most: int = 1024) -> tuple[Path, float, int, str]:
     """Run a program that shares the cache with jax; its folder, result, hits and warnings."""
-
-    def run(most: int = 1024) -> tuple[Path, float, int, str]:
-        environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_COMPILATION")}
-        environment["XDG_CACHE_HOME"] = str(tmp_path)
-        done = subprocess.run(
-            [sys.executable, "-c", JAX.format(most=most)],
-            env=environment,
-            capture_output=True,
-            text=True,
-        )
-        assert done.returncode == 0, done.stderr
-        value, hits = done.stdout.split()
-        return tmp_path / "egosim_jax" / "jax", float(value), int(hits), done.stderr
-
-    return run
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_COMPILATION")}
+    environment["XDG_CACHE_HOME"] = str(home)
+    done = subprocess.run(
+        [sys.executable, "-c", JAX.format(most=most)],
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    value, hits = done.stdout.split()
+    return home / "egosim_jax" / "jax", float(value), int(hits), done.stderr
 
 
-def test_jaxs_own_cache_is_private_and_bounded(with_jax):
-    folder, want, hits, stderr = with_jax()
-    assert (hits, stderr) == (0, "")
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory):
+    """The cache home of a first run, a copy of it, and the result, hits and warnings."""
+    home = tmp_path_factory.mktemp("filled") / "home"
+    _, *seen = run_with_jax(home)
+    return home, shutil.copytree(home, home.with_name("copy")), *seen
+
+
+@pytest.fixture
+def with_jax(filled):
+    """The folder and result of a first run, and a function that runs the program again."""
+    home, copy, want, *_ = filled  # jax's keys depend on the path
+    shutil.rmtree(home)
+    shutil.copytree(copy, home)
+    return home / "egosim_jax" / "jax", want, partial(run_with_jax, home)
+
+
+def test_jaxs_own_cache_is_private_and_bounded(with_jax, filled):
+    folder, want, run = with_jax
+    assert filled[3:] == (0, "")
     assert folder.stat().st_mode & 0o777 == 0o700
     files = set(folder.iterdir())
-    assert with_jax() == (folder, want, len(files), "")
+    assert run() == (folder, want, len(files), "")
     oldest = min(files, key=lambda path: path.name)
     os.utime(oldest, (1, 1))
     (folder / "of_xla").mkdir()  # XLA's caches for GPUs are folders in it
-    assert with_jax(most=len(files) - 1) == (folder, want, len(files) - 1, "")
+    assert run(most=len(files) - 1) == (folder, want, len(files) - 1, "")
 
 
 def test_jax_compiles_again_what_was_cut_off(with_jax):
-    folder, want, *_ = with_jax()
+    folder, want, run = with_jax
     for path in folder.iterdir():
         path.write_bytes(path.read_bytes()[:-40])
-    _, got, hits, stderr = with_jax()
+    _, got, hits, stderr = run()
     assert (got, hits) == (want, 0)
     assert "Error reading persistent compilation cache entry" in stderr
 
@@ -301,9 +315,9 @@ def test_jax_compiles_again_what_was_cut_off(with_jax):
     ids=["mode", "owner", "hard link", "symbolic link", "below"],
 )
 def test_jax_does_not_read_what_others_could_have_written(with_jax, change, why):
-    folder, want, *_ = with_jax()
+    folder, want, run = with_jax
     change(folder)
-    _, got, hits, stderr = with_jax()
+    _, got, hits, stderr = run()
     assert (got, hits) == (want, 0)
     assert why in stderr
 

@@ -6,11 +6,17 @@ from scipy.spatial.transform import Rotation
 
 from egosim_jax.geometry import transform
 from egosim_jax.perception.grasps import (
+    MAX_ENDS,
+    Grip,
+    complete_hand,
     couplings,
     find_holds,
     hinge_motion,
+    is_behind,
     is_between,
+    is_firm,
     palm_motion,
+    seen_frames,
 )
 
 TOLERANCE_M = 0.01
@@ -64,6 +70,39 @@ def test_the_grip_is_a_cylinder_between_thumb_and_fingers(point_cm, between):
     assert is_between(away, tips, radius_m=0.01) is between
 
 
+@pytest.mark.parametrize(
+    ("width_cm", "in_front_cm", "gripped"),
+    [
+        (6, 3, True),
+        (4, 5, True),
+        (2, 3, False),
+        (10, 3, True),
+        (16, 3, False),
+        (6, 8, False),
+        (6, -2, False),
+    ],
+    ids=[
+        "its front",
+        "smaller",
+        "too small",
+        "wider",
+        "too wide",
+        "too far in front",
+        "behind the grip",
+    ],
+)
+def test_a_grip_is_inside_an_object_behind_its_front(width_cm, in_front_cm, gripped):
+    """A camera above sees the top of a box, which the fingers take further down."""
+    (tips,) = fingers([6])
+    across = (tips[1:].mean(axis=0) - tips[0]) / 0.06
+    up = np.cross(across, [1.0, 0.3, 0.2])
+    up /= np.linalg.norm(up)
+    along = np.linspace(-width_cm / 200, width_cm / 200, 9)
+    middle = (tips[0] + tips[1:].mean(axis=0)) / 2
+    top = middle + along[:, None] * across + in_front_cm / 100 * up
+    assert is_behind(top, tips, middle + 0.5 * up, radius_m=0.012) is gripped
+
+
 def test_a_hinge_turns_a_held_object_about_its_axis():
     """The fingertips hold a handle while it turns by 80 degrees, and then leave it."""
     axis = np.array([1.0, 0.2, 0]) / np.linalg.norm([1, 0.2, 0])
@@ -115,3 +154,55 @@ def turn(axis, point, angle):
     motion[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
     motion[:3, 3] = point - motion[:3, :3] @ point
     return motion
+
+
+@pytest.mark.parametrize(
+    ("low_cm", "high_cm", "travel_cm", "firm"),
+    [
+        ([0.2, -1, -1], [4.8, 1, 1], 10, True),
+        ([-0.8, -1, -1], [5.8, 1, 1], 10, True),
+        ([0.2, -1, -1], [4.8, 1, 1], 1, False),
+        ([2, -2, -2], [8, 2, 2], 10, False),
+        ([0.2, 0.4, -1], [4.8, 4, 1], 10, False),
+        ([2, -0.2, -0.2], [2.5, 0.2, 0.2], 10, False),
+    ],
+    ids=[
+        "both sides touched",
+        "soft fingertips",
+        "not carried away",
+        "a finger would be inside",
+        "closed next to it",
+        "not closed on it",
+    ],
+)
+def test_a_grip_is_firm_if_both_sides_are_touched_and_it_leaves(low_cm, high_cm, travel_cm, firm):
+    low, high = np.array(low_cm) / 100, np.array(high_cm) / 100
+    faces = np.concatenate([np.c_[np.eye(3), -high], np.c_[-np.eye(3), low]])
+    tips = np.zeros((6, 3, 3))
+    tips[:, 1:, 0] = 0.05
+    tips[:, :, 2] = np.linspace(0, travel_cm / 100, 6)[:, None]
+    assert is_firm(faces, tips, (0, 5)) == firm
+
+
+def test_a_noisy_opening_is_no_evidence_of_a_hold():
+    tips = np.zeros((60, 3, 3))
+    tips[20:40, 1:, 0] = 0.04
+    tips[:20, 1:, 0] = tips[40:, 1:, 0] = 0.09
+    assert find_holds(tips, TOLERANCE_M) == ([(20, 39)], True)
+    tips[:, 1:, 0] += np.random.default_rng(0).normal(0, 0.005, (60, 1))
+    holds, sure = find_holds(tips, TOLERANCE_M)
+    assert not sure
+    assert MAX_ENDS * (MAX_ENDS - 1) / 2 - MAX_ENDS <= len(holds) <= MAX_ENDS**2 / 2
+    assert {0, 59} <= {frame for hold in holds for frame in hold}
+
+
+def test_a_hand_rests_where_it_enters_and_leaves_and_is_interpolated_in_between():
+    joints = np.full((8, 21, 3), np.nan)
+    for frame in (2, 3, 5):
+        joints[frame] = np.random.default_rng(1).normal(0, 0.05, (21, 3)) + frame
+    complete = complete_hand(joints, seen_frames(joints))
+    step = (complete - complete[2]).mean(axis=(1, 2))
+    np.testing.assert_allclose(step, [0, 0, 0, 1, 2, 3, 3, 3], atol=1e-9)
+    eyes = np.zeros((8, 3))
+    grip = Grip.of(joints, "human", eyes, tolerance_m=TOLERANCE_M, radius_m=0.01)
+    assert grip.holds == [(2, 4), (2, 5), (3, 5)]

@@ -1,4 +1,4 @@
-"""Parts of the object tracker: supporting planes, and the fall after a release."""
+"""Parts of the object tracker: supporting planes, the fall after a release, and the put-down."""
 
 import numpy as np
 import pytest
@@ -8,6 +8,7 @@ from egosim_jax.perception.object_motion import (
     _support_plane,
     fall,
     object_model,
+    snap,
 )
 from egosim_jax.perception.pose_refinement import ObjectModel, ObjectMotion
 from egosim_jax.types import SceneState
@@ -106,3 +107,32 @@ def test_other_objects_do_not_fall(options):
     np.testing.assert_array_equal(
         fall(carried(**options), OTHERS, FPS).path, carried(**options).path
     )
+
+
+@pytest.mark.parametrize(
+    ("end_m", "height_m"),
+    [
+        ([0.1, 0, 0.006], 0.0),
+        ([0.1, 0, -0.006], 0.0),
+        ([0.3, 0, 0.106], 0.1),
+        ([0.3, 0, 0.094], 0.1),
+        ([0.1, 0, 0.03], 0.03),
+        ([0.1, 0, -0.03], -0.03),
+    ],
+    ids=["above", "below", "above a block", "in a block", "too far above", "too far below"],
+)
+def test_what_was_put_down_has_its_first_height_above_the_support(end_m, height_m):
+    path = snap(carried(end_m), OTHERS).path
+    np.testing.assert_allclose(path[-1, :3, 3], [*end_m[:2], height_m], atol=1e-6)
+    np.testing.assert_allclose(path[8, :3, 3], path[-1, :3, 3] / 2, atol=1e-9)
+    np.testing.assert_array_equal(path[:5], carried(end_m).path[:5])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"released": 16}, {"hinged": True}, {"plane": np.array([0, 0, 1, np.nan])}],
+    ids=["held to the end", "on a hinge", "no surface known"],
+)
+def test_nothing_else_is_put_down(options):
+    motion = carried([0.1, 0, 0.006], **options)
+    np.testing.assert_array_equal(snap(motion, OTHERS).path, motion.path)

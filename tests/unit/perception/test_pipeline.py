@@ -1,6 +1,6 @@
 """Stages see earlier results, and errors name the missing field of a pipeline."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -106,5 +106,5 @@ def test_a_stage_of_another_size_is_named():
 def test_stages_do_not_change_the_record_before_them():
     before = Observation()
     after = poses(*asked(), before)
-    assert all(getattr(before, field.name) is None for field in fields(before))
+    assert before == Observation()
     assert after.cameras is CAMERAS

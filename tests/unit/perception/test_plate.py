@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from egosim_jax.perception.plate import clean_plate
+from egosim_jax.types import Cameras
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND
 from tests.unit.perception.posed import make_clip
 
@@ -65,6 +66,31 @@ def test_pixels_that_no_frame_shows_are_filled_by_patches(clip, covered):
     assert not plate.seen.any()
     filled = plate.image[moving[0]]
     assert np.abs(filled - np.array([20, 10, 5])).sum(axis=1).min() > 10
+
+
+@pytest.mark.parametrize("method", ["patchmatch", "telea"])
+def test_a_hole_next_to_a_moved_object_is_filled_with_background(method, monkeypatch):
+    if method == "telea":
+        monkeypatch.setitem(__import__("sys").modules, "patchmatch", None)
+    frames = np.full((3, 60, 90, 3), (90, 120, 90), np.uint8)
+    frames += np.random.default_rng(0).integers(0, 20, frames.shape, np.uint8)
+    moving, moved = np.zeros((2, 3, 60, 90), bool)
+    moving[:, 20:40, 40:60] = moved[0, 15:45, 15:40] = moved[1:, 15:45, 35:60] = True
+    moving[1:] &= ~moved[1:]  # the object is now in front of the hole
+    frames[moved] = (220, 30, 30)
+    frames[moving] = (20, 10, 5)
+    cameras = Cameras(
+        world_from_camera=np.tile(np.eye(4), (3, 1, 1)),
+        intrinsics_px=np.array([[50.0, 0, 44.5], [0, 50, 29.5], [0, 0, 1]]),
+        height=60,
+        width=90,
+    )
+    plate = clean_plate(frames, moving, cameras, np.ones((60, 90)), moved=moved)
+    hole = moving[0] & ~moved[0]
+    assert plate.method == method
+    assert not plate.seen.any()
+    assert plate.image[hole, 0].max() < 150
+    assert (plate.image[15:45, 15:37] == frames[0, 15:45, 15:37]).all()
 
 
 def test_without_the_library_telea_fills(clip, covered, monkeypatch):

@@ -37,7 +37,7 @@ def test_each_threshold_is_an_option():
     ("options", "message"),
     [
         ("--hands.discs 0", "discs must be at least 1"),
-        ("--surfaces.point-px 0", "point_px must be at least 1"),
+        ("--moved.point-px 0", "point_px must be at least 1"),
         ("--motion.blur-px 0", "blur_px must be positive"),
         ("--motion.opening-tolerance-m 0", "opening_tolerance_m must be positive"),
         ("--motion.refinement.deviation-m 0", "deviation_m must be positive, or None"),

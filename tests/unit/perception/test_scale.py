@@ -7,7 +7,13 @@ import pytest
 
 from egosim_jax.geometry import pixel_rays
 from egosim_jax.perception.estimates import CameraEstimate, DepthEstimate, Verdict
-from egosim_jax.perception.scale import FINGERTIPS, estimate_scale, scale_cameras, scale_depth
+from egosim_jax.perception.scale import (
+    FINGERTIPS,
+    contact_scale,
+    estimate_scale,
+    scale_cameras,
+    scale_depth,
+)
 from egosim_jax.types import Cameras, InputError
 
 UNIT_M = 0.37
@@ -126,3 +132,18 @@ def test_cameras_and_depth_are_scaled_once(estimate, table):
 def test_a_scale_that_is_not_positive_is_refused(estimate, table):
     with pytest.raises(InputError, match="--scale"):
         estimate_scale(estimate, table, meters_per_unit=-1.0)
+
+
+def test_fingertips_touch_the_object_that_they_begin_to_move(estimate):
+    depth = np.full((HEIGHT, WIDTH), 2 * TABLE_M / UNIT_M)
+    ids = np.zeros((HEIGHT, WIDTH), np.int32)
+    ids[20:30, 30:40] = 4
+    depth[ids == 4] = TABLE_M / UNIT_M
+    joints = np.full((FRAMES, 2, 21, 3), np.nan)
+    joints[5:8, 1] = [0, 0, TABLE_M]
+    contacts = np.array([[frame, 1, 4] for frame in range(4, 8)])
+    scale = contact_scale(estimate.cameras, depth, ids, joints, contacts)
+    assert scale is not None
+    assert scale.meters_per_unit == pytest.approx(UNIT_M)
+    assert contact_scale(estimate.cameras, depth, ids, joints, contacts[:1]) is None
+    assert contact_scale(estimate.cameras, depth, 0 * ids, joints, contacts) is None

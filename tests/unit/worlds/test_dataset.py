@@ -30,11 +30,17 @@ def test_an_interrupted_run_resumes_and_gives_the_same_shards(tmp_path):
     assert not (broken / "parts").exists()
 
 
-def test_a_finished_folder_is_not_written_again(tmp_path):
-    list(make_shards(ROBOT, out=tmp_path, workers=1))
-    before = (tmp_path / "manifest.json").stat().st_mtime_ns
-    assert list(make_shards(ROBOT, out=tmp_path, workers=1)) == [5]
-    assert (tmp_path / "manifest.json").stat().st_mtime_ns == before
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("finished")
+    list(make_shards(ROBOT, out=folder, workers=1))
+    return folder
+
+
+def test_a_finished_folder_is_not_written_again(finished):
+    before = (finished / "manifest.json").stat().st_mtime_ns
+    assert list(make_shards(ROBOT, out=finished, workers=1)) == [5]
+    assert (finished / "manifest.json").stat().st_mtime_ns == before
 
 
 @dataclass(frozen=True)
@@ -83,7 +89,6 @@ def test_the_manifest_has_the_grid_that_the_clips_fit(tmp_path):
     assert ShardReader(tmp_path).manifest.grid == GRID
 
 
-def test_a_finished_dataset_of_another_grid_is_refused(tmp_path):
-    list(make_shards(ROBOT, out=tmp_path, workers=1))
+def test_a_finished_dataset_of_another_grid_is_refused(finished):
     with pytest.raises(InputError, match="another latent grid"):
-        list(make_shards(ROBOT, out=tmp_path, workers=1, grid=GRID))
+        list(make_shards(ROBOT, out=finished, workers=1, grid=GRID))

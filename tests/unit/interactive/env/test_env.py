@@ -1,5 +1,6 @@
 """Gymnasium environments of a painted world: without a model."""
 
+import warnings
 from dataclasses import replace
 
 import gymnasium
@@ -11,6 +12,7 @@ from egosim_jax.interactive import env as egosim
 from egosim_jax.interactive.env import rewards
 from egosim_jax.interactive.env.action_spec import LAYOUTS, ActionSpec
 from egosim_jax.interactive.env.rewards import GoalImage, MoveObject
+from egosim_jax.interactive.env.single import WorldEnv
 from egosim_jax.interactive.env.vector import WorldVectorEnv
 from egosim_jax.simulation.start import Start
 from egosim_jax.types import InputError
@@ -83,7 +85,7 @@ def test_invalid_rows_are_refused_and_change_nothing(rows, message):
     before = env.unwrapped.running.info()
     with pytest.raises(InputError, match=message):
         env.unwrapped.chunk_step(rows)
-    assert env.unwrapped.running.info() == before
+    np.testing.assert_equal(env.unwrapped.running.info(), before)
 
 
 def test_a_start_is_saved_and_loaded_whole(tmp_path):
@@ -148,6 +150,55 @@ def test_a_vector_environment_equals_its_episodes():
         single, _, _, _, info = env.unwrapped.chunk_step(rows)
         np.testing.assert_array_equal(observed["frames"][number], single["frames"])
         assert infos["state_sha256"][number] == info["state_sha256"]
+
+
+def test_infos_of_a_vector_environment_have_the_figures_and_poses_of_each_episode():
+    envs = WorldVectorEnv(painted(), 2)
+    envs.reset(seed=3)
+    infos = envs.chunk_step(np.stack([envs.actions.rest[None]] * 2))[-1]
+    for number, running in enumerate(envs.running):
+        _, single = running.simulate(running.chunk(envs.actions.rest[None]))
+        assert single.keys() <= infos.keys()
+        known = running.info()
+        assert known["object_poses"].keys() == set(known["objects"])
+        for key, pose in known["object_poses"].items():
+            np.testing.assert_array_equal(infos["object_poses"][key][number], pose)
+            assert infos["objects"][key][number] == known["objects"][key]
+    for name in ("validity", "object_validity"):
+        assert infos[name].shape == (2,)
+        assert infos[name].dtype == float
+
+
+def test_the_default_prompt_names_no_object():
+    for fields, prompt in (
+        ({}, "The right hand moves."),
+        ({"sides": ("left",)}, "The left hand moves."),
+        ({"sides": ("right", "left")}, "The hands move."),
+        ({"layout": "gripper"}, "The gripper moves."),
+        ({"layout": "gripper", "sides": ("right", "left")}, "The grippers move."),
+    ):
+        assert painted().start(3, ActionSpec(**fields)).prompt == prompt
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("workspace_m", [None, ((0.2, 0.1, 0.2), (0.4, 0.3, 0.5))])
+def test_noise_on_a_resting_row_stays_within_the_bounds(layout, workspace_m):
+    spec = ActionSpec(layout=layout, camera=True, sides=("right", "left"))
+    spec = spec if workspace_m is None else replace(spec, workspace_m=workspace_m)
+    low, high = spec.bounds
+    assert (np.minimum(spec.rest - low, high - spec.rest) >= 0.0499 * (high - low)).all()
+
+
+def test_a_scene_of_another_world_than_the_weights_is_said_at_the_reset():
+    world = replace(painted(), trained_on="tabletop")
+    start = world.start(3, ActionSpec())
+    env = WorldEnv(world)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env.reset(options={"start": start})
+    other = replace(start, state=replace(start.state, provenance={"source": "video"}))
+    with pytest.warns(UserWarning, match="trained on clips of the tabletop world"):
+        env.reset(options={"start": other})
 
 
 def test_an_ended_episode_must_be_reset_alone():

@@ -130,6 +130,23 @@ def test_a_reward_that_cannot_judge_the_episode_is_refused_at_its_reset(count, r
         env.reset(seed=3)
 
 
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"number": "10"}, "must be an id, a whole number"),
+        ({"number": 10.0}, "must be an id, a whole number"),
+        ({"number": True}, "must be an id, a whole number"),
+        ({"offset_m": (0.1, 0.0)}, "must be x, y and z in meters"),
+        ({"offset_m": (0.1, 0.0, np.nan)}, "must be x, y and z in meters"),
+        ({"tolerance_m": 0.0}, "must be above 0"),
+    ],
+    ids=repr,
+)
+def test_a_task_that_no_episode_can_have_is_refused_at_once(fields, message):
+    with pytest.raises(InputError, match=message):
+        MoveObject(**{"number": 10, "offset_m": (0.1, 0.0, 0.0), **fields})
+
+
 def test_the_advice_about_an_unknown_object_works():
     numbers = make(0).reset(seed=3)[1]["objects"]
     for number in numbers:

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
+from egosim_jax.interactive.env.single import WorldEnv
 from egosim_jax.interactive.env.true_world import TrueWorld
 from egosim_jax.interactive.server import session as session_module
+from egosim_jax.interactive.server import wire
 from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.interactive.server.session import Session
 from egosim_jax.interactive.server.store import Limits, Store
@@ -218,6 +220,27 @@ def test_a_reset_and_a_load_continue_the_step_numbers(store):
     reopened = Session(session.folder, store.backend)
     assert reopened.now.seed == 4
     assert reopened.result.info == reset.info
+
+
+def test_a_session_reports_figures_and_poses_as_an_environment_does(store):
+    made = store.create({"seed": 3})
+    result = step(store, made, 1)
+    env = WorldEnv(painted(), actions=made.actions)
+    env.reset(seed=3)
+    info = env.chunk_step(rows(made))[-1]
+    for name in ("validity", "object_validity", "object_poses", "objects"):
+        assert result.info[name] == wire.to_json(info[name])
+    assert Session(made.folder, store.backend).result.info == result.info
+
+
+def test_a_session_in_a_scene_that_the_weights_do_not_know_says_so(tmp_path):
+    world = replace(painted(), trained_on="tabletop")
+    start = world.start(3, ActionSpec())
+    made = Session.create(tmp_path / "one", world, ActionSpec(), start)
+    assert "scene_warning" not in made.result.info
+    other = replace(start, state=replace(start.state, provenance={"source": "video"}))
+    info = made.restart(other).info
+    assert "egosim models fetch egosim_14b" in info["scene_warning"]
 
 
 def test_an_episode_of_a_session_can_be_simulated_again(store):

@@ -1,9 +1,11 @@
 """Metric hands from keypoints in pixels: exact for known hands."""
 
+from fractions import Fraction
+
 import numpy as np
 
 from egosim_jax.perception.estimates import LEFT, RIGHT, HandTracks
-from egosim_jax.perception.hands import lift
+from egosim_jax.perception.hands import lift, steady
 
 INTRINSICS_PX = np.array([[600.0, 0, 415.5], [0, 620.0, 239.5], [0, 0, 1]])
 
@@ -56,3 +58,15 @@ def test_a_hand_that_would_be_behind_the_camera_is_missing():
     shape, joints_m = hands()
     tracks = tracks_of(-shape, joints_m)
     assert np.isnan(lift(tracks, INTRINSICS_PX)).all()
+
+
+def test_hands_of_changing_size_get_one_size_and_stay_on_their_rays():
+    known = np.repeat(hands(1)[1], 20, axis=0)
+    error = np.random.default_rng(0).uniform(0.8, 1.25, (20, 2, 1, 1))
+    error[::2] = 1  # most sizes are right, and so is the median
+    calm = steady(known * error, Fraction(16))
+    np.testing.assert_allclose(calm[..., :2] / calm[..., 2:], known[..., :2] / known[..., 2:])
+    np.testing.assert_allclose(calm, known, rtol=0.05)
+    known[3, LEFT] = np.nan
+    assert np.isnan(steady(known, Fraction(16))[3, LEFT]).all()
+    assert np.isfinite(steady(known, Fraction(16))[4]).all()

@@ -49,6 +49,7 @@ def test_a_missing_device_is_refused(folder):
         DepthAnything(folder, device="cuda:7")(FRAMES, STILL, UNKNOWN_CAMERAS, [0])
 
 
+@pytest.mark.slow
 def test_the_calling_process_never_imports_torch(folder):
     code = (
         "import sys, numpy as np\n"

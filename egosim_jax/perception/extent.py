@@ -1,0 +1,230 @@
+"""Choice between growths of a moved object by the whole scene that each one predicts.
+
+A growth with half the object leaves the other half behind, and one with a part of the table takes
+it along. Both look wrong where the object was and where it went. So all growths are compared over
+the same pixels: those that the object of any growth covers, before or after the move.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from egosim_jax.geometry import cameras_in_object_frame, invert, pixels_of, transform
+from egosim_jax.perception.pose_refinement import ColorCost, ObjectModel, ObjectMotion
+from egosim_jax.rendering.reference import splat
+from egosim_jax.state.new_objects import is_among
+from egosim_jax.types import Cameras, SceneState
+
+FRAMES = 5
+"""Number of compared frames, from the grasp to the end."""
+SMALLER = 0.1
+"""Exponent of a part's relative size in the factor on its cost."""
+WITHOUT_EDGES = 1.2
+"""Factor on the cost of a part without edges."""
+NOISE = 3.0
+"""Difference from the clip that means nothing, in 8-bit levels."""
+MIN_KNOWN = 0.25
+"""Minimum fraction of the covered pixels that can be compared; fewer decide nothing."""
+MARGIN_M = 0.05
+"""Distance around the moved points within which the state is drawn, in meters."""
+POINT_PX = 2
+"""Size of the drawn points in pixels."""
+SMOOTHED, SMOOTHINGS = 12, 4
+"""Number of nearest points that decide together whether they move, and number of rounds."""
+AT_REST = 5.0
+"""Minimum advantage of a resting point over a moving one, in 8-bit levels."""
+SQUARE = np.ones((3, 3), np.uint8)
+"""A pixel and its neighbors."""
+
+
+Candidate = tuple[float, ObjectMotion]
+"""Change of the cost by a motion, less the highest accepted one; and the motion."""
+
+
+def choose_extent(
+    candidates: Sequence[Candidate],
+    growths: Sequence[ObjectModel],
+    cameras: Cameras,
+    state: SceneState,
+    shown: Float32[np.ndarray, "f h w 3"],
+    hidden: Bool[np.ndarray, "f h w"],
+    color: ColorCost,
+) -> int:
+    """Return the index of the candidate whose part of a cluster explains the clip best.
+
+    The cluster has some growths, the whole first; a moving part has no edges. A smaller growth must
+    explain the clip better, and a part without edges better still: gray frames explain nothing. If
+    too little can be compared, the points of each candidate alone decide.
+    """
+    if len(candidates) == 1:
+        return 0
+    motions = [motion for _, motion in candidates]
+    costs = predicted_costs(motions, growths[0], cameras, state, shown, hidden, color)
+    if costs is None:
+        changes = np.array([change for change, _ in candidates])
+        costs = changes - changes.min()
+    sizes = np.array([len(motion.model.points_m) for motion in motions])
+    edged = [any(motion.model is growth for growth in growths) for motion in motions]
+    factors = (len(growths[0].points_m) / sizes) ** SMALLER * np.where(edged, 1.0, WITHOUT_EDGES)
+    return int(np.argmin((costs + NOISE) * factors))
+
+
+def moving_part(
+    motion: ObjectMotion,
+    cameras: Cameras,
+    shown: Float32[np.ndarray, "f h w 3"],
+    hidden: Bool[np.ndarray, "f h w"],
+    color: ColorCost,
+) -> ObjectModel:
+    """Return a cluster without the points that the clip shows at rest.
+
+    A lid has no edge where it is flush with its box. Points that could be both move along.
+    """
+    from scipy.spatial import KDTree
+
+    model, frames = motion.model, _compared_frames([motion])
+    poses = invert(cameras.world_from_camera[frames])
+    local = replace(cameras, world_from_camera=cameras.world_from_camera[frames])
+    paths = (np.repeat(np.eye(4)[None], len(frames), axis=0), motion.path[frames])
+    at_rest, moved = (
+        _residuals(
+            transform(poses @ path, model.points_m),
+            model,
+            local,
+            shown[frames],
+            hidden[frames],
+            color,
+        )
+        for path in paths
+    )
+    gain = np.nan_to_num(at_rest - moved).mean(axis=0)
+    near = KDTree(model.points_m).query(model.points_m, min(SMOOTHED, len(gain)))[1]
+    for _ in range(SMOOTHINGS):
+        gain = gain[near].mean(axis=1)
+    moves = gain > -AT_REST
+    return replace(model, points_m=model.points_m[moves], colors=model.colors[moves])
+
+
+def _residuals(
+    local_m: Float[np.ndarray, "g n 3"],
+    model: ObjectModel,
+    cameras: Cameras,
+    shown: Float32[np.ndarray, "g h w 3"],
+    hidden: Bool[np.ndarray, "g h w"],
+    color: ColorCost,
+) -> Float[np.ndarray, "g n"]:
+    """Return each point's color difference from the clip under any light; NaN where not seen."""
+    row, column, inside = pixels_of(cameras, local_m)
+    frame = np.broadcast_to(np.arange(len(local_m))[:, None], row.shape)
+    row, column = np.where(inside, row, 0), np.where(inside, column, 0)
+    there = shown[frame, row, column]
+    gaps = color.apart(there, model.colors)
+    return np.where(inside & ~hidden[frame, row, column], gaps, np.nan)
+
+
+def predicted_costs(
+    motions: Sequence[ObjectMotion],
+    whole: ObjectModel,
+    cameras: Cameras,
+    state: SceneState,
+    shown: Float32[np.ndarray, "f h w 3"],
+    hidden: Bool[np.ndarray, "f h w"],
+    color: ColorCost,
+) -> Float[np.ndarray, " m"] | None:
+    """Return how far the scene that each motion predicts is from the clip, in 8-bit levels.
+
+    The support is behind the `whole` cluster. Behind a part of it nothing is known, so these pixels
+    are not compared. If too few are left, the result is None.
+    """
+    import cv2
+
+    frames = _compared_frames(motions)
+    local = replace(cameras, world_from_camera=cameras.world_from_camera[frames])
+    shown, hidden = shown[frames], hidden[frames]
+    near = _near(motions, state)
+    points, colors = state.points_m[near], state.colors[near].astype(np.float32)
+    ground = _ground_color(motions[0], points, colors)
+    layers = [_draw(motion, frames, local, points) for motion in motions]
+    compared = np.any([layer[1] >= 0 for layer in layers], axis=0)
+    everything = np.concatenate([m.model.points_m for m in motions]).astype(np.float32)
+    compared |= splat(everything, local, point_px=POINT_PX)[1] >= 0
+    covered = compared & ~hidden
+    compared = covered.copy()
+    predicted = []
+    for motion, (moved_m, moved, rest_m, rest) in zip(motions, layers, strict=True):
+        behind = ground if motion.model is whole else np.full(3, np.nan, np.float32)
+        drawn = np.append(colors, behind[None], axis=0)[rest]
+        nearer = (moved >= 0) & (moved_m < rest_m)
+        drawn = np.where(nearer[..., None], motion.model.colors[moved], drawn)
+        unknown = np.asarray(np.isnan(drawn).any(axis=-1))
+        compared &= ~np.stack([cv2.dilate(f.astype(np.uint8), SQUARE) > 0 for f in unknown])
+        predicted.append(_closest(np.nan_to_num(drawn), shown))
+    if compared.sum() <= MIN_KNOWN * covered.sum():
+        return None
+    costs = [color.mean(shown[compared], drawn[compared]) for drawn in predicted]
+    return np.array(costs)
+
+
+def _closest(
+    drawn: Float32[np.ndarray, "g h w 3"], shown: Float32[np.ndarray, "g h w 3"]
+) -> Float32[np.ndarray, "g h w 3"]:
+    """Return the color nearest to the shown one between those drawn within a pixel.
+
+    So a border that the clip blurs, or shows a pixel aside, costs nothing.
+    """
+    import cv2
+
+    low, high = (
+        np.stack([function(frame, SQUARE) for frame in drawn])
+        for function in (cv2.erode, cv2.dilate)
+    )
+    return np.clip(shown, low, high)
+
+
+def _compared_frames(motions: Sequence[ObjectMotion]) -> Int[np.ndarray, " g"]:
+    first = min(motion.grasped for motion in motions)
+    last = len(motions[0].path) - 1
+    return np.unique(np.rint(np.linspace(first, last, FRAMES + 1)[1:]).astype(int))
+
+
+def _near(motions: Sequence[ObjectMotion], state: SceneState) -> Bool[np.ndarray, " n"]:
+    """Return the state's points in the box of the moved points, widened by a margin."""
+    places = np.concatenate(
+        [
+            motion.model.points_m @ pose[:3, :3].T + pose[:3, 3]
+            for motion in motions
+            for pose in motion.path[[0, motion.released, -1]]
+        ]
+    )
+    low, high = places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M
+    return ((state.points_m >= low) & (state.points_m <= high)).all(axis=1)
+
+
+def _ground_color(
+    motion: ObjectMotion, points_m: Float32[np.ndarray, "n 3"], colors: Float32[np.ndarray, "n 3"]
+) -> Float32[np.ndarray, " 3"]:
+    """Return the color of the supporting plane; NaN without points on it."""
+    plane = motion.model.plane
+    on = np.abs(points_m @ plane[:3] + plane[3]) < 0.005
+    if not on.any():
+        return np.full(3, np.nan, np.float32)
+    return np.median(colors[on], axis=0).astype(np.float32)
+
+
+def _draw(
+    motion: ObjectMotion,
+    frames: Int[np.ndarray, " g"],
+    cameras: Cameras,
+    points_m: Float32[np.ndarray, "n 3"],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return depth and index of the moved object, and of the points that it leaves behind."""
+    model = motion.model
+    local = cameras_in_object_frame(cameras, motion.path[frames])
+    moved_m, moved = splat(model.points_m, local, point_px=POINT_PX)
+    left = np.flatnonzero(~is_among(points_m, model.points_m.astype(np.float32)))
+    rest_m, rest = splat(points_m[left], cameras, point_px=POINT_PX)
+    return moved_m, moved, rest_m, np.append(left, len(points_m))[rest]
