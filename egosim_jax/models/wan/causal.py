@@ -132,6 +132,7 @@ def by_run(x: Float[Array, "b g *d"], lengths: Sequence[int]) -> Float[Array, "b
     if len(lengths) == 1:
         return x
     devices = parts("tokens") if several_devices() else 1
+    x = constrain(x, ("batch", *[None] * (x.ndim - 1)))  # not by channels, as runs are cut out
     unit = math.gcd(*lengths, sum(lengths) // devices)
     rows = [
         jnp.broadcast_to(x[:, n : n + 1], (len(x), length // unit, *x.shape[2:]))

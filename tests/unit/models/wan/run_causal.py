@@ -40,7 +40,7 @@ def main(out):
     """Compute the same with every mesh."""
     graph, state = reference.network()
     arrays = reference.inputs(sum(SIZES), len(SIZES), batch=BATCH)
-    dit = network()
+    dit, clips = network(), jax.tree.map(np.asarray, given(BATCH))  # on no device yet
     found = {}
     for name, sizes in MESHES.items():
         mesh = sizes and make_mesh(MeshConfig(**dict(zip(("data", "fsdp", "context"), sizes))))  # noqa: B905
@@ -53,7 +53,7 @@ def main(out):
                     *jax.device_put(arrays, batch_sharding(mesh)),
                 )
         student = ChunkDenoiser(STUDENT, shard_params(dit, mesh), mesh)
-        found[f"{name}: generated"] = np.concatenate(list(student.latents(*given(BATCH))), axis=1)
+        found[f"{name}: generated"] = np.concatenate(list(student.latents(*clips)), axis=1)
         for form, result in zip(("packed", "cached", "gradients"), results, strict=True):
             flat = [np.ravel(array) for array in jax.tree.leaves(result)]
             found[f"{name}: {form}"] = np.concatenate(flat)
