@@ -27,6 +27,7 @@ from egosim_jax.geometry import cameras_in_object_frame
 from egosim_jax.perception.new_surfaces import NewSurfaces
 from egosim_jax.perception.object_motion import TrackObjects
 from egosim_jax.perception.pipeline import Observation, Pipeline
+from egosim_jax.perception.pose_refinement import ColorCost
 from egosim_jax.perception.registry import register
 from egosim_jax.perception.silhouettes import HandShape, hand_silhouette
 from egosim_jax.rendering.reference import splat
@@ -58,6 +59,12 @@ class MovedObjects:
 
     point_px: int = 2
     """Size of the state's rendered points, in pixels."""
+    max_residual: float = 40.0
+    """Maximum color difference from the moved object where its depth is set, in 8-bit levels.
+
+    A clip may leave the object where it was, or draw a wider hand."""
+    color: ColorCost = field(default_factory=ColorCost)
+    """Comparison of colors."""
 
     def __post_init__(self) -> None:
         """Check that points have a size."""
@@ -66,7 +73,10 @@ class MovedObjects:
     def __call__(
         self, clip: Clip, action: Action, state: SceneState, so_far: Observation
     ) -> Observation:
-        """Set `depth_m` (infinite where no object moved, and at hands) and `object_ids`."""
+        """Set `object_ids` of moved objects, and `depth_m` where the clip shows them.
+
+        `depth_m` is infinite elsewhere.
+        """
         cameras, hand_ids, motions = (
             so_far.require(field, "MovedObjects") for field in ("cameras", "object_ids", "motions")
         )
@@ -76,12 +86,18 @@ class MovedObjects:
         rest = state.points_m[~np.isin(state.object_ids, list(motions))]
         nearest, _ = splat(rest, cameras, point_px=self.point_px)
         for number, motion in motions.items():
-            points = state.points_m[state.object_ids == number].astype(float)
+            own = state.object_ids == number
+            points, colors = state.points_m[own].astype(float), state.colors[own]
             local = cameras_in_object_frame(cameras, motion)
             moved, index = splat(points, local, point_px=self.point_px)
             nearer = (index >= 0) & (moved < nearest) & (hand_ids >= 0)
-            nearest[nearer] = depth[nearer] = moved[nearer]
+            nearest[nearer] = moved[nearer]
             ids[nearer] = number
+            frames, expected = (
+                x.astype(np.float32) for x in (clip.frames[nearer], colors[index[nearer]])
+            )
+            shown = self.color.apart(frames, expected) <= self.max_residual
+            depth[nearer] = np.where(shown, moved[nearer], np.inf)
         return replace(so_far, depth_m=depth, object_ids=ids)
 
 
