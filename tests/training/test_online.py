@@ -191,23 +191,39 @@ def test_a_training_without_an_end_is_refused(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_run_is_the_same_in_programs_of_one_and_of_two_updates(tmp_path):
+def test_a_run_is_the_same_in_programs_of_two_updates_and_when_it_was_interrupted(tmp_path):
     Networks.random(DEBUG, seed=0).save(tmp_path / "start")
     (tmp_path / "latents").mkdir()
     write_shard(tmp_path / "latents" / "a.npz", rows_of(2 * CHUNK))
     model = replace(DEBUG, dit=replace(DEBUG.dit, layers=3))
 
-    def train(out, per_program):
+    def train(out, per_program, *, until=9):
         plan = OnlineTraining(
             model=model, start=tmp_path / "start", out=tmp_path / out, updates=4, workers=0,
             latents=tmp_path / "latents", batch=2, per_program=per_program, decoder_share=0.0,
-            first_clips=CHUNK, clips=2 * CHUNK, frames=CHUNK,
+            first_clips=CHUNK, clips=2 * CHUNK, frames=CHUNK, save_s=0.0,
         )  # fmt: skip
         run = OnlineRun(plan)
+        update = run._update
+
+        def limited(share):
+            if run.progress.done == until:
+                raise KeyboardInterrupt
+            return update(share)
+
+        run._update = limited
         run.train()
         return run
 
     one, two = train("one", 1), train("two", 2)
+    with pytest.raises(KeyboardInterrupt):
+        train("resumed", 1, until=3)
+    resumed = train("resumed", 1)
+    assert resumed.progress.get_state() | {"seconds": 0, "first": 0} == (
+        one.progress.get_state() | {"seconds": 0, "first": 0}
+    )
+    for a, b in zip(*(jax.tree.leaves(run.state) for run in (one, resumed)), strict=True):
+        np.testing.assert_array_equal(a, b)
     assert int(one.state.step) == int(two.state.step) == 4
     for a, b in zip(*(jax.tree.leaves(run.state.params) for run in (one, two)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)

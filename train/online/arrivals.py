@@ -45,8 +45,11 @@ class Clips(threading.Thread):
             time.sleep(0.1)
 
 
-def start_workers(plan: OnlineTraining, folder: Path) -> list[subprocess.Popen]:
-    """Start the processes that make scenes, first the held-out ones."""
+def start_workers(plan: OnlineTraining, folder: Path, *, made: int) -> list[subprocess.Popen]:
+    """Start the processes that make scenes, first the held-out ones.
+
+    `made` clips were made before an interruption; a scene has at least one of them.
+    """
     threads = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", **dict.fromkeys(threads, "1")}
     command = [sys.executable, "-m", "egosim_jax.train.online.scenes"]
@@ -55,7 +58,10 @@ def start_workers(plan: OnlineTraining, folder: Path) -> list[subprocess.Popen]:
     with (plan.out / "scenes.log").open("a") as log:
         return [
             subprocess.Popen(  # noqa: S603 - this package's module
-                [*command, str(plan.first_scene + number)], env=environment, stderr=log, stdout=log
+                [*command, str(plan.first_scene + made + number)],
+                env=environment,
+                stderr=log,
+                stdout=log,
             )
             for number in range(plan.workers)
         ]

@@ -3,7 +3,8 @@
 The learning rates follow the share of the run's time, or of its updates, that has passed: a linear
 warm-up of `WARMUP` updates, then a cosine to a hundredth. Latents made beforehand (`latents`) are
 read first, and as they arrive. Weights are written as parts of at most 16 MiB, at intervals and at
-the end.
+the end, and so are checkpoints: the same command resumes an interrupted run. It waits for clips
+again, because checkpoints have none.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from flax import nnx
 from egosim_jax.configs.model import Networks
 from egosim_jax.data.records import stacked
 from egosim_jax.io import parts, weights
+from egosim_jax.io.checkpoint import Checkpoints
 from egosim_jax.train.deepen import deepen_weights
 from egosim_jax.train.metric_writers import JsonLines
 from egosim_jax.train.online.arrivals import Clips, start_workers
@@ -38,6 +40,7 @@ from egosim_jax.train.online.pool import (
     raw_shapes,
     videos_of,
 )
+from egosim_jax.train.online.progress import Progress
 from egosim_jax.train.online.updates import (
     Updater,
     make_decoder_update,
@@ -57,7 +60,6 @@ class OnlineRun:
     def __init__(self, plan: OnlineTraining):
         self.plan, self.began = plan, time.monotonic()
         plan.out.mkdir(parents=True, exist_ok=True)
-        self.log = JsonLines(plan.out / "metrics.jsonl", resume_after=0)
         model = plan.model
         start = deepen_weights(plan.start, plan.layers, plan.out / "start")
         only = (*model.trained_networks, "vae")
@@ -79,6 +81,14 @@ class OnlineRun:
         self.pool = Pool(latent_shapes(model, plan.clips))
         self.frames = Pool(self._frame_shapes())
         self.read: set[Path] = set()
+        self.progress = Progress()
+        self.checkpoints = Checkpoints(plan.out / "checkpoints")
+        if self.checkpoints.steps:
+            states = {"denoiser": self.state, "decoder": self.decoder_state}
+            states = self.checkpoints.restore(states, self.progress, fallback=True)
+            self.state, self.decoder_state = states["denoiser"], states["decoder"]
+            self.began -= self.progress.seconds
+        self.log = JsonLines(plan.out / "metrics.jsonl", resume_after=self.progress.done)
 
     def _frame_shapes(self) -> dict[str, jax.ShapeDtypeStruct]:
         count, model = self.plan.frames, self.plan.model
@@ -101,16 +111,17 @@ class OnlineRun:
         with TemporaryDirectory(dir=plan.out) as folder:
             clips, processes = Clips(Path(folder)), []
             try:
-                processes = start_workers(plan, Path(folder))
+                processes = start_workers(plan, Path(folder), made=self.progress.arrived)
                 clips.start()
                 self._compile()
                 self._wait_for_clips(clips)
                 self._loop(clips)
+                self.save()
             finally:
                 for process in processes:
                     process.kill()
-        self.save()
-        self._say(step=self.done, validation=self.validate(clips.held))
+                self.checkpoints.close()
+        self._say(step=self.progress.done, validation=self.validate(clips.held))
 
     def _compile(self) -> None:
         """Compile the programs side by side; those that no update needs may come later."""
@@ -187,6 +198,7 @@ class OnlineRun:
             except queue.Empty:
                 return
             rows = self.encode(self.vae, raw)
+            self.progress.arrived += CHUNK
             at = np.arange(CHUNK, dtype=np.int32) + self.pool.position
             self.pool.append(rows)
             latents = rows["target"]
@@ -195,14 +207,13 @@ class OnlineRun:
             )
 
     def _loop(self, clips: Clips) -> None:
-        plan = self.plan
-        first = logged = validated = saved = self.seconds
-        refreshed, rate, counted = 0.0, 0.0, (0, 0)
-        self.done = self.decoded = 0
-        self.decoder_first: float | None = None
-        self.pace: int | None = None
+        plan, progress = self.plan, self.progress
+        logged = validated = saved = self.seconds
+        if progress.first is None:
+            progress.first = self.seconds
+        refreshed, rate, counted = 0.0, 0.0, (progress.done, progress.decoded)
         pending: list[Mapping[str, jax.Array]] = []
-        while (share := self._share(first, self.done)) < 1:
+        while (share := self._share()) < 1:
             metrics = self._update(share)
             rate = plan.learning_rate * schedule(share)
             if self._ready("decoder") and len(self.frames) >= min(plan.frames, 8 * CHUNK):
@@ -214,51 +225,56 @@ class OnlineRun:
                 jax.block_until_ready(pending[-3]["loss"])  # two programs wait on the device
             self._admit(clips, limit=2)
             now, generate = self.seconds, self._ready("generate")
-            if self.decoded and generate and share > 1 / 3 and now - refreshed > 30:
+            if progress.decoded and generate and share > 1 / 3 and now - refreshed > 30:
                 self._refresh(generate)
                 refreshed = now
             if now - logged > plan.log_s:
                 paces = [
                     (n - m) / (now - logged)
-                    for n, m in zip((self.done, self.decoded), counted, strict=True)
+                    for n, m in zip((progress.done, progress.decoded), counted, strict=True)
                 ]
                 self._say(
                     values=means(pending),
-                    step=self.done,
+                    step=self.progress.done,
                     rate=rate,
                     clips=self.pool.appended,
                     queue=clips.chunks.qsize(),
                     updates_per_s=paces[0],
                     decoder_per_s=paces[1],
                 )
-                pending, logged, counted = pending[-2:], now, (self.done, self.decoded)
+                pending, logged, counted = pending[-2:], now, (progress.done, progress.decoded)
             if now - validated > plan.validate_s:
                 validated = now
-                self._say(step=self.done, validation=self.validate(clips.held))
+                self._say(step=self.progress.done, validation=self.validate(clips.held))
             if now - saved > plan.save_s:
                 saved = now
                 self.save()
-        self._say(step=self.done, decoder_step=self.decoded, skipped=int(self.state.skipped))
+        self._say(
+            step=self.progress.done,
+            decoder_step=self.progress.decoded,
+            skipped=int(self.state.skipped),
+        )
 
     def _update(self, share: float) -> Mapping[str, jax.Array]:
         """Run a program of the denoiser's updates."""
         plan = self.plan
-        steps = self.done + 1 + np.arange(plan.per_program)
+        steps = self.progress.done + 1 + np.arange(plan.per_program)
         rates = plan.learning_rate * schedule(share) * np.minimum(1, steps / WARMUP)
         rows = np.int32(len(self.pool))
         self.state, metrics = self.updates(
             self.state, self.pool.arrays, rows, rates.astype(np.float32)
         )
-        self.done += plan.per_program
+        self.progress.done += plan.per_program
         return metrics
 
     def _decode(self, share: float, *, generated: bool = False) -> Mapping[str, jax.Array]:
         """Run an update of the decoder."""
         plan = self.plan
-        if self.decoder_first is None:
-            self.decoder_first = share
-        part = (share - self.decoder_first) / (1 - self.decoder_first)
-        warm = min(1.0, 3 * (self.decoded + 1) / WARMUP)
+        if self.progress.decoder_first is None:
+            self.progress.decoder_first = share
+        first = self.progress.decoder_first
+        part = (share - first) / (1 - first)
+        warm = min(1.0, 3 * (self.progress.decoded + 1) / WARMUP)
         self.decoder_state, metrics = self._ready("decoder")(
             self.decoder_state,
             self.frozen,
@@ -267,21 +283,21 @@ class OnlineRun:
             np.float32(plan.generated if generated else 0),
             np.float32(plan.decoder_rate * schedule(part) * warm),
         )
-        self.decoded += 1
+        self.progress.decoded += 1
         return metrics
 
     def _decoder_updates(self, share: float) -> int:
         """Return the number of decoder updates next to one program of the denoiser's."""
-        if self.pace is None:  # both are timed once
+        if self.progress.pace is None:  # both are timed once
             seconds = [_seconds(run, share) for run in (self._update, self._decode)]
             ratio = self.plan.decoder_share / (1 - self.plan.decoder_share)
-            self.pace = max(1, round(ratio * seconds[0] / seconds[1]))
-            self._say(step=self.done, program_s=seconds[0], decoder_s=seconds[1])
-        return self.pace
+            self.progress.pace = max(1, round(ratio * seconds[0] / seconds[1]))
+            self._say(step=self.progress.done, program_s=seconds[0], decoder_s=seconds[1])
+        return self.progress.pace
 
-    def _share(self, first: float, done: int) -> float:
+    def _share(self) -> float:
         """Return the share of the run that has passed, of its time or of its updates."""
-        shares = []
+        shares, first, done = [], self.progress.first or 0.0, self.progress.done
         if self.plan.minutes is not None:
             shares.append((self.seconds - first) / max(1.0, 60 * self.plan.minutes - first))
         if self.plan.updates is not None:
@@ -326,7 +342,14 @@ class OnlineRun:
         return totals
 
     def save(self) -> None:
-        """Write the averaged weights of all networks, as parts of at most 16 MiB."""
+        """Write the averaged weights of all networks, as parts of at most 16 MiB, and a checkpoint.
+
+        The checkpoint is written in the background.
+        """
+        if self.progress.done not in self.checkpoints.steps:
+            self.progress.seconds = self.seconds
+            states = {"denoiser": self.state, "decoder": self.decoder_state}
+            self.checkpoints.save(self.progress.done, states, self.progress)
         trained = nnx.merge(self.graph, self.state.average)
         vae: Any = nnx.merge(self.vae_graph, self.decoder_state.average, self.frozen).vae
         networks = Networks(dit=trained.dit, text=trained.text, image=trained.image, vae=vae)
