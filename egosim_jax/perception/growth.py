@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from egosim_jax.geometry import UP_AXES, up_of
+from egosim_jax.geometry import upward
 from egosim_jax.perception.grasps import Grip, from_grip
 from egosim_jax.perception.pose_refinement import ObjectModel
 from egosim_jax.state.planes import support_planes
@@ -80,14 +80,13 @@ class Surroundings:
         cls,
         state: SceneState,
         chosen: Int[np.ndarray, " k"],
-        eye_m: Float[np.ndarray, " 3"],
+        world_from_camera: Float[np.ndarray, "4 4"],
         config: Growth,
     ) -> Surroundings:
         """Return the surroundings of a hand from the chosen points of a state."""
         points, colors = state.points_m[chosen], state.colors[chosen].astype(np.float32)
-        up = np.array(UP_AXES[up_of(state)])
-        looks_down = up_of(state) == "-y"  # the first camera's own axis, far from the vertical
-        surfaces = support_planes(points, up, eye_m=eye_m if looks_down else None)
+        up, eye_m = upward(state, world_from_camera)
+        surfaces = support_planes(points, up, eye_m=eye_m)
         plane = surfaces[0].plane if surfaces else np.array([*up, np.nan])
         heights = points @ plane[:3] + plane[3]
         near = np.abs(heights)
@@ -102,7 +101,7 @@ class Surroundings:
             noise_m=noise,
             low_colors=colors[low],
             plane=plane,
-            eye_m=eye_m,
+            eye_m=world_from_camera[:3, 3],
             config=config,
         )
 
@@ -364,7 +363,7 @@ def clusters_without_id(
     free = free[np.min(gaps, axis=0) <= config.max_extent_m]
     if len(free) < config.min_points:
         return [], "closed on nothing" if grip.sure else ""
-    around = Surroundings.of(state, free, cameras.world_from_camera[0, :3, 3], config)
+    around = Surroundings.of(state, free, cameras.world_from_camera[0], config)
     clusters, note = around.touched([grip.tips_m[frame] for frame in grip.grasps])
     return clusters, note if grip.sure else ""
 

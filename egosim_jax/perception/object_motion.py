@@ -17,7 +17,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from egosim_jax.geometry import UP_AXES, Up, invert, pixels_of, transform, up_of
+from egosim_jax.geometry import invert, pixels_of, transform, upward
 from egosim_jax.perception.extent import Candidate, choose_extent, moving_part
 from egosim_jax.perception.grasps import MIN_HELD, Grip, couplings, is_firm, seen_frames
 from egosim_jax.perception.growth import NEW, Growth, clusters_without_id
@@ -31,7 +31,7 @@ from egosim_jax.perception.pose_refinement import (
     refine_pose,
 )
 from egosim_jax.state.new_objects import next_object_id, with_objects
-from egosim_jax.state.planes import fit_plane
+from egosim_jax.state.planes import support_planes
 from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState, check_counts
 
 GRAVITY = 9.81
@@ -187,7 +187,7 @@ def _best_candidate(
     found: list[Candidate] = []
     held = False
     for number in _near_tips(grip.tips_m, state, config):
-        model = object_model(number, state, config)
+        model = object_model(number, state, config, action.cameras.world_from_camera[0])
         held |= any(grip.has(model.points_m, grasped) for grasped in grip.grasps)
         name = state.names.get(number, "").lower()
         prior = config.prompt_prior if name and name in action.prompt.lower() else 1.0
@@ -278,7 +278,12 @@ def _near_tips(
     return near
 
 
-def object_model(number: int, state: SceneState, config: TrackObjects) -> ObjectModel:
+def object_model(
+    number: int,
+    state: SceneState,
+    config: TrackObjects,
+    world_from_camera: Float[np.ndarray, "4 4"],
+) -> ObjectModel:
     """Return the model of an object. Its plane is horizontal if no surface is around it."""
     own = state.object_ids == number
     points = state.points_m[own].astype(float)
@@ -286,7 +291,9 @@ def object_model(number: int, state: SceneState, config: TrackObjects) -> Object
         number=number,
         points_m=points,
         colors=state.colors[own].astype(np.float32),
-        plane=_support_plane(points, state.points_m[~own], config, up=up_of(state)),
+        plane=_support_plane(
+            points, state.points_m[~own], config, *upward(state, world_from_camera)
+        ),
     )
 
 
@@ -294,18 +301,25 @@ def _support_plane(
     points_m: Float[np.ndarray, "n 3"],
     others_m: Float32[np.ndarray, "m 3"],
     config: TrackObjects,
-    *,
-    up: Up = "z",
+    up: Float[np.ndarray, " 3"],
+    eye_m: Float[np.ndarray, " 3"] | None,
 ) -> Float[np.ndarray, " 4"]:
-    """Fit the plane (a, b, c, d) with the most inliers around an object (RANSAC).
+    """Fit the horizontal plane (a, b, c, d) with the most inliers around an object (RANSAC).
 
-    With too few points, return a horizontal plane of unknown height.
+    A box beside the object may have more points than the ground, so vertical planes are excluded.
+    Without a horizontal one, return a plane of unknown height. `up` and `eye_m` as in `upward`.
     """
     distances = np.linalg.norm(others_m - points_m.mean(axis=0), axis=1)
     near = others_m[distances < config.plane_radius_m]
-    if len(near) < config.min_points:
-        return np.array([*UP_AXES[up], np.nan])
-    return fit_plane(near, config.plane_tolerance_m)[0]
+    found = support_planes(
+        near,
+        up,
+        eye_m=eye_m,
+        tolerance_m=config.plane_tolerance_m,
+        min_points=config.min_points,
+        max_planes=1,
+    )
+    return found[0].plane if found else np.array([*up, np.nan])
 
 
 def fall(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"], fps: int) -> ObjectMotion:

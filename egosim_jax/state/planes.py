@@ -67,6 +67,7 @@ def support_planes(
     eye_m: Float[np.ndarray, " 3"] | None = None,
     tolerance_m: float = 0.006,
     min_points: int = 30,
+    max_planes: int | None = None,
 ) -> list[SupportPlane]:
     """Return the horizontal surfaces of a scene, the largest first; the others are parallel to it.
 
@@ -80,7 +81,7 @@ def support_planes(
     upward = up / np.linalg.norm(up)
     max_angle = PARALLEL_DEG if eye_m is None else MAX_TILT_DEG
     for _ in range(MAX_FITS):
-        if len(rest) < max(min_points, 3):
+        if len(rest) < max(min_points, 3) or len(found) == max_planes:
             break
         plane, inliers = fit_plane(points_m[rest], tolerance_m)
         if len(inliers) < min_points:
