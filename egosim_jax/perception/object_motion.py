@@ -41,6 +41,7 @@ from egosim_jax.perception.pose_refinement import (
 from egosim_jax.state.new_objects import next_object_id, with_objects
 from egosim_jax.state.planes import fit_plane
 from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState, check_counts
+from egosim_jax.types.data import object_name
 
 GRAVITY = 9.81
 """Acceleration of a fall in m/s^2."""
@@ -119,7 +120,7 @@ class TrackObjects:
         return replace(
             so_far,
             new_objects=new,
-            names={**(so_far.names or {}), **{number: f"object {number}" for number in new}},
+            names={**(so_far.names or {}), **{number: object_name(number, {}) for number in new}},
             notes=(*so_far.notes, *notes),
             motions={m.model.number: m.path for m in moved},
             support_planes={m.model.number: m.model.plane for m in moved},
