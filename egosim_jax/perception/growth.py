@@ -256,26 +256,31 @@ class Surroundings:
     def with_seam(
         self, members: Bool[np.ndarray, " n"], whole: Bool[np.ndarray, " n"]
     ) -> Bool[np.ndarray, " n"]:
-        """Return an object's points with those at its border whose color it has.
+        """Return an object's points, with each point at its border on the side of its color.
 
         At a concave edge to another object, the shape does not say which points are on which side.
         """
         from scipy.spatial import KDTree
 
-        (outside,) = np.nonzero(whole & ~members)
-        close = self._is_next_to(outside, members)
-        seam, rest = outside[close], outside[~close]
-        if not len(seam) or len(rest) < SEAM_COLORS:
+        outside = whole & ~members
+        at_border = np.zeros_like(members)
+        for side, beyond in ((outside, members), (members & self.hollow, outside)):
+            if side.any() and beyond.any():
+                at_border[side] = self._is_next_to(np.flatnonzero(side), beyond)
+        seam, own, rest = (
+            np.flatnonzero(part) for part in (at_border, members & ~at_border, outside & ~at_border)
+        )
+        if not len(seam) or min(len(own), len(rest)) < SEAM_COLORS:
             return members
 
         def difference(others: Int[np.ndarray, " m"]) -> Float[np.ndarray, " s"]:
             nearest = KDTree(self.points_m[others]).query(self.points_m[seam], SEAM_COLORS)[1]
-            colors, own = self.colors[others][nearest], self.colors[seam][:, None]
-            light = (own * colors).sum(axis=2) / np.maximum((colors**2).sum(axis=2), 1)
-            return np.linalg.norm(own - light[..., None] * colors, axis=2).min(axis=1)
+            colors, shown = self.colors[others][nearest], self.colors[seam][:, None]
+            light = (shown * colors).sum(axis=2) / np.maximum((colors**2).sum(axis=2), 1)
+            return np.linalg.norm(shown - light[..., None] * colors, axis=2).min(axis=1)
 
         grown = members.copy()
-        grown[seam] = difference(np.flatnonzero(members)) < difference(rest)
+        grown[seam] = difference(own) < difference(rest)
         return grown
 
     def model(self, members: Bool[np.ndarray, " n"]) -> ObjectModel:

@@ -3,10 +3,12 @@
 A grasped object moves with the hand. A candidate combines an object near a fingertip, two frames
 of a possible hold, and a motion of the hand that the object may follow (`grasps`). Its cost is the
 mean difference between the object's colors and the clip's colors where the object would be visible.
-The candidate that most improves on the object at rest is accepted. An object between the closing
-fingertips counts as moved unless the clip clearly shows it at rest. If they hold nothing with an
-id, candidates are grown from the points between them (`growth`), and `extent` chooses how far. A
-released object falls (`fall`) or is put down (`snap`), and `pose_refinement` refines its last pose.
+The candidate that most improves on the object at rest is accepted. If the time of the release is
+unknown, the whole scene that each end predicts decides between the best ends. An object between
+the closing fingertips counts as moved unless the clip clearly shows it at rest. If they hold
+nothing with an id, candidates are grown from the points between them (`growth`), and `extent`
+chooses how far. A released object falls (`fall`) or is put down (`snap`), and `pose_refinement`
+refines its last pose.
 """
 
 from __future__ import annotations
@@ -18,7 +20,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from egosim_jax.geometry import invert, pixels_of, transform, upward
-from egosim_jax.perception.extent import Candidate, choose_extent, moving_part
+from egosim_jax.perception.extent import (
+    Candidate,
+    best_of,
+    choose_extent,
+    moving_part,
+    with_other_ends,
+)
 from egosim_jax.perception.grasps import MIN_HELD, Grip, couplings, is_firm, seen_frames
 from egosim_jax.perception.growth import NEW, Growth, clusters_without_id
 from egosim_jax.perception.hulls import hull_on_plane
@@ -33,6 +41,7 @@ from egosim_jax.perception.pose_refinement import (
 from egosim_jax.state.new_objects import next_object_id, with_objects
 from egosim_jax.state.planes import support_planes
 from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState, check_counts
+from egosim_jax.types.data import object_name
 
 GRAVITY = 9.81
 """Acceleration of a fall in m/s^2."""
@@ -52,6 +61,8 @@ class TrackObjects:
     """Maximum distance from a fingertip to a candidate object, in meters."""
     opening_tolerance_m: float = 0.01
     """Maximum change of the distance between fingertips during a hold, in meters."""
+    ends: int = 8
+    """Maximum number of ends that are compared if the time of the release is unknown."""
     min_points: int = 30
     """Minimum number of points of an object, and of a surface around it."""
     compared_points: int = 150
@@ -91,7 +102,7 @@ class TrackObjects:
 
     def __post_init__(self) -> None:
         """Check that the numbers of points, the tolerance and the blur are positive."""
-        check_counts({"min_points": self.min_points, "compared_points": self.compared_points})
+        check_counts({n: getattr(self, n) for n in ("ends", "min_points", "compared_points")})
         for name in ("opening_tolerance_m", "blur_px"):
             if getattr(self, name) <= 0:
                 raise InputError(f"{name} must be positive, not {getattr(self, name)}.")
@@ -109,7 +120,7 @@ class TrackObjects:
         return replace(
             so_far,
             new_objects=new,
-            names={**(so_far.names or {}), **{number: f"object {number}" for number in new}},
+            names={**(so_far.names or {}), **{number: object_name(number, {}) for number in new}},
             notes=(*so_far.notes, *notes),
             motions={m.model.number: m.path for m in moved},
             support_planes={m.model.number: m.model.plane for m in moved},
@@ -184,39 +195,38 @@ def _best_candidate(
         tolerance_m=config.opening_tolerance_m,
         radius_m=config.grip_radius_m,
     )
-    found: list[Candidate] = []
+    scene = action.cameras, state, shown, hidden, config.color
+    found: list[list[Candidate]] = []
     held = False
     for number in _near_tips(grip.tips_m, state, config):
         model = object_model(number, state, config, action.cameras.world_from_camera[0])
         held |= any(grip.has(model.points_m, grasped) for grasped in grip.grasps)
         name = state.names.get(number, "").lower()
         prior = config.prompt_prior if name and name in action.prompt.lower() else 1.0
-        best = _best_motion(model, grip, prior, action.cameras, shown, hidden, config)
-        found += [best] if best else []
+        found.append(_best_motions(model, grip, prior, action.cameras, shown, hidden, config))
     if held:
-        return min(found, key=lambda candidate: candidate[0], default=None), ""
+        return best_of(found, *scene), ""
     clusters, note = clusters_without_id(grip, action.cameras, state, config.growth)
     for growths in clusters:
         tried = [
-            _best_motion(model, grip, 1.0, action.cameras, shown, hidden, config)
+            _best_motions(model, grip, 1.0, action.cameras, shown, hidden, config)
             for model in growths
         ]
-        moved = [best for best in tried if best is not None]
+        moved = [ranked for ranked in tried if ranked]
         if moved:
-            part = moving_part(moved[0][1], action.cameras, shown, hidden, config.color)
+            part = moving_part(moved[0][0][1], action.cameras, shown, hidden, config.color)
             if config.min_points <= len(part.points_m) < config.part * len(growths[0].points_m):
-                best = _best_motion(part, grip, 1.0, action.cameras, shown, hidden, config)
-                moved += [best] if best else []
-            scene = action.cameras, state, shown, hidden, config.color
-            found.append(moved[choose_extent(moved, growths, *scene)])
-    if found:
-        return min(found, key=lambda candidate: candidate[0]), ""
+                ranked = _best_motions(part, grip, 1.0, action.cameras, shown, hidden, config)
+                moved += [ranked] if ranked else []
+            found.append(moved[choose_extent([r[0] for r in moved], growths, *scene)])
+    if best := best_of(found, *scene):
+        return best, ""
     if clusters and grip.sure:
         note = "closed on something without an id that the clip shows at rest"
     return None, note
 
 
-def _best_motion(
+def _best_motions(
     model: ObjectModel,
     grip: Grip,
     prior: float,
@@ -224,13 +234,15 @@ def _best_motion(
     shown: Float32[np.ndarray, "f h w 3"],
     hidden: Bool[np.ndarray, "f h w"],
     config: TrackObjects,
-) -> Candidate | None:
-    """Return the best accepted motion of an object with one hand, after its change of cost.
+) -> list[Candidate]:
+    """Return the accepted motions of an object with one hand, after their change of cost.
 
     The change is relative to the object at rest, because an object in the table's color costs
     little anywhere. It is 0 if the object is not visible, and lower for an object in the grip.
+    The first motion has the lowest. If the opening does not say when the hand held the object, the
+    best ones with other ends follow.
     """
-    best: Candidate | None = None
+    accepted: list[Candidate] = []
     still = np.repeat(np.eye(4)[None], len(shown), axis=0)
     rest = _cost(model, still, cameras, shown, hidden, config)
     improvement = max(config.min_improvement, (1 - config.max_cost_ratio) * rest)
@@ -248,18 +260,17 @@ def _best_motion(
             cost = prior * _cost(model, path, cameras, shown, hidden, config)
             known = np.isfinite(cost) and np.isfinite(rest)
             change = (cost - rest if known else 0.0) - max_change
-            if change < (0.0 if best is None else best[0]):
-                best = (
-                    change,
-                    ObjectMotion(
-                        model=model,
-                        grasped=hold[0],
-                        released=hold[1],
-                        path=path,
-                        hinged=path is hinge,
-                    ),
+            if change < 0:
+                motion = ObjectMotion(
+                    model=model,
+                    grasped=hold[0],
+                    released=hold[1],
+                    path=path,
+                    hinged=path is hinge,
                 )
-    return best
+                accepted.append((change, motion))
+    accepted.sort(key=lambda candidate: candidate[0])
+    return accepted[:1] if grip.sure else with_other_ends(accepted, config.ends)
 
 
 def _near_tips(

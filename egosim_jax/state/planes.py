@@ -36,7 +36,7 @@ class SupportPlane:
     plane: Float[np.ndarray, " 4"]
     """Plane (a, b, c, d); the unit normal points up."""
     inliers: Int[np.ndarray, " n"]
-    """Indices of the points on the surface."""
+    """Indices of the points on the surface, and on no larger one."""
 
     def heights(self, points_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Return the heights of points above the surface, in meters."""
@@ -94,10 +94,10 @@ def support_planes(
         if angle > max_angle or (found and area_of(points_m[on], plane) < MIN_AREA_M2):
             continue
         upward, max_angle = (plane[:3], PARALLEL_DEG) if not found else (upward, max_angle)
-        heights = points_m @ plane[:3] + plane[3]
-        found.append(
-            SupportPlane(plane=plane, inliers=np.flatnonzero(np.abs(heights) <= tolerance_m))
-        )
+        own = np.abs(points_m @ plane[:3] + plane[3]) <= tolerance_m
+        for larger in found:
+            own[larger.inliers] = False
+        found.append(SupportPlane(plane=plane, inliers=np.flatnonzero(own)))
     return found
 
 
