@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
@@ -22,8 +23,8 @@ from flax import nnx
 from jaxtyping import Float
 
 from egosim_jax.io.bounded import listing
-from egosim_jax.io.mapped import OURS
-from egosim_jax.io.weights import flat_shapes
+from egosim_jax.io.mapped import OURS, read_safetensors
+from egosim_jax.io.weights import WeightsError, flat_shapes, mismatches
 from egosim_jax.models.layers import Linear, LowRank, LowRankParam
 from egosim_jax.types import InputError
 
@@ -160,6 +161,26 @@ def pairs(tensors: Mapping[str, T]) -> dict[str, tuple[T, T]]:
 def metadata(config: str, *, base: str) -> dict[str, str]:
     """Return the metadata of a file; `base` is the hash of the weights that it was trained on."""
     return {"format": OURS, "config": config, BASE: base}
+
+
+def state_of(path: Path, abstract: nnx.State) -> nnx.State:
+    """Return the low-rank weights of networks from a file of the denoiser's LoRA.
+
+    Raises `InputError` unless the file has exactly the low-rank weights of `abstract`.
+    """
+    leaves = [item for item in nnx.to_flat_state(abstract) if isinstance(item[1], LowRankParam)]
+    # A path in a file has neither the network's name nor that of the layer's low-rank part.
+    wanted = {".".join(map(str, (*path[1:-2], path[-1]))): (path, leaf) for path, leaf in leaves}
+    tensors = read_safetensors(path)
+    shapes = {name: tuple(leaf.shape) for name, (_, leaf) in wanted.items()}
+    if problems := mismatches(tensors, shapes):
+        raise WeightsError(problems, source=str(path))
+    return nnx.from_flat_state(
+        [
+            (where, leaf.replace(jnp.asarray(tensors[name].array(), jnp.float32)))
+            for name, (where, leaf) in wanted.items()
+        ]
+    )
 
 
 def start(
