@@ -22,8 +22,8 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Float
 
-from egosim_jax.io.bounded import listing
-from egosim_jax.io.mapped import OURS, read_safetensors
+from egosim_jax.io.bounded import listing, quote_path, quote_text
+from egosim_jax.io.mapped import OURS, read_metadata, read_safetensors
 from egosim_jax.io.weights import WeightsError, flat_shapes, mismatches
 from egosim_jax.models.layers import Linear, LowRank, LowRankParam
 from egosim_jax.types import InputError
@@ -98,6 +98,30 @@ def apply(network: Any, changes: Mapping[str, Change], *, scale: float = 1.0) ->
                     "it. (--lora-scale)"
                 )
             layers[path].low_rank = LowRank(down, scaled)
+
+
+def merge(network: Any, path: Path, *, base: str) -> None:
+    """Add the low-rank changes of one of our files to the weights of a network, in place.
+
+    Raises `InputError` if the file names base weights of another hash, or does not fit.
+    """
+    if (own := read_metadata(path).get(BASE)) != base:
+        raise InputError(
+            f"{quote_path(path)} is a LoRA of weights with the hash {quote_text(str(own)[:12])}, "
+            f"but those next to it have {base[:12]}. Give the weights that it was trained on. "
+            "(--weights)"
+        )
+    tensors = {name: tensor.array() for name, tensor in read_safetensors(path).items()}
+    changes = from_tensors(tensors)
+    check(flat_shapes(network), changes)
+    full = {}
+    for name, change in changes.items():
+        if isinstance(change, Delta):
+            low = (np.asarray(array, np.float32) for array in (change.down, change.up))
+            full[f"{name}.kernel"] = np.matmul(*low)
+        else:
+            full[name] = change
+    apply(network, full)
 
 
 def deltas_of(network: Any) -> dict[str, Delta]:
