@@ -207,6 +207,8 @@ def write_trained(
 ) -> Path:
     """Write OUT/lora.safetensors if `rank` is given, else a complete OUT/weights.
 
+    Of a student, OUT/weights also links the LoRA and its base.
+
     `start` is the weights folder that the training started from: the base of the LoRA, or the
     source of untrained networks. All processes of the training call it with the same arguments.
     """
@@ -233,6 +235,11 @@ def write_trained(
                     **metadata_of("dit", model.chunks),
                 },
             )
+            if model.chunks is not None:
+                (folder := out / "weights").mkdir(exist_ok=True)
+                (folder / weights.STUDENT).unlink(missing_ok=True)
+                (folder / weights.STUDENT).symlink_to(path.resolve())
+                weights.link_others(folder, start)
         return path
     folder = out / "weights"
     trained.save(folder, dtype=model.dit.dtype)

@@ -367,7 +367,8 @@ def _with_roles(state: TrainState, task: Distillation, teacher: nnx.State) -> Tr
     critic = None
     if task.critic is not None:
         critic = TrainState.create(jax.tree.map(jnp.copy, teacher), task.critic.optimizer)
-    kept: Any = jax.tree.map(lambda leaf: leaf.astype(task.frozen_dtype), teacher)
+    # Copies: the state is donated, so no array may be in it twice.
+    kept: Any = jax.tree.map(lambda leaf: jnp.array(leaf, task.frozen_dtype), teacher)
     return replace(state, teacher=kept, critic=critic)
 
 
