@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, ClassVar
 from egosim_jax.runtime.command import HelpGroups
 from egosim_jax.train.config import CriticConfig
 from egosim_jax.train.fine_tuning import FineTuning
-from egosim_jax.train.update import Stage
+from egosim_jax.train.task import Stage
 from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from egosim_jax.models.layers import Products
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.train.config import TrainConfig
 from egosim_jax.train.recipe import Recipe
-from egosim_jax.train.update import Stage
+from egosim_jax.train.task import Stage
 from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:

@@ -39,14 +39,8 @@ from egosim_jax.train.distributed import count_distinct, is_preempted
 from egosim_jax.train.metric_writers import Console, JsonLines, TensorBoard, WandB, Writer
 from egosim_jax.train.monitor import Clock, Samples, SkipMonitor, Watchdog
 from egosim_jax.train.run_page import TIMES, write_page
-from egosim_jax.train.update import (
-    Distillation,
-    Programs,
-    Task,
-    TrainState,
-    mean_metrics,
-    mean_validation,
-)
+from egosim_jax.train.task import Distillation, Task
+from egosim_jax.train.update import Programs, TrainState, mean_metrics, mean_validation
 from egosim_jax.types import InputError
 
 
@@ -67,10 +61,10 @@ def train(
 
     `validation` is a folder of shards to validate on, with fixed noise. `weights` is a folder to
     start from instead of random weights, `lora` a LoRA of it to train further. `teacher` is the
-    folder of a distillation's teacher, by default the student at its start. OUT gets config.json, environment.json, metrics.jsonl,
-    times.json, checkpoints/ and samples/. `run_folder`, by default OUT, gets index.html, the page
-    of all stages of the run. All processes of a run call this with the same arguments; the first
-    one writes.
+    folder of a distillation's teacher, by default the student at its start. OUT gets config.json,
+    environment.json, metrics.jsonl, times.json, checkpoints/ and samples/. `run_folder`, by default
+    OUT, gets index.html, the page of all stages of the run. All processes of a run call this with
+    the same arguments; the first one writes.
     """
     training.check_packages()
     digests = None if weights is None else hashes(weights)

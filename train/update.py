@@ -1,4 +1,4 @@
-"""One training update: its task, its state, its pure functions and their compiled form.
+"""One training update: its state, its pure functions and their compiled form.
 
     (state, frozen weights, batch)  ->  loss and gradients  ->  guard  ->  optimizer  ->  state
 
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol, no_type_check, runtime_checkable
+from typing import Any, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -23,16 +23,8 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Key
 
 from egosim_jax.sharding import batch_sharding, check_batch, constrain, state_sharding
-from egosim_jax.train.config import (
-    CriticConfig,
-    OptimizerConfig,
-    TrainConfig,
-    learning_rate,
-    make_optimizer,
-)
-
-Batch = Mapping[str, jax.Array]
-Metrics = dict[str, jax.Array]
+from egosim_jax.train.config import OptimizerConfig, TrainConfig, learning_rate, make_optimizer
+from egosim_jax.train.task import Batch, Distillation, Metrics, Roles, Task
 
 GUARD_WARMUP = 50
 """Updates before the guard compares a gradient norm with the running mean."""
@@ -40,87 +32,6 @@ GRAD_NORM_DECAY = 0.98
 """Decay of the running mean of gradient norms; it averages over about 50 updates."""
 MAX_CONSECUTIVE_SKIPS = 3
 """Number of consecutive skipped updates that stops the run."""
-
-
-@runtime_checkable
-class Task(Protocol):
-    """Networks to train, their examples and their loss."""
-
-    @property
-    def trained(self) -> Any:
-        """The nnx filter of the trained weights; all others are frozen."""
-        ...
-
-    @property
-    def frozen_dtype(self) -> str:
-        """The dtype of the frozen weights."""
-        ...
-
-    def networks(self, rngs: nnx.Rngs) -> nnx.Module:
-        """Return the networks with random weights."""
-        ...
-
-    def examples(self) -> Any:
-        """Return the Grain transform from a record to an example, a dict of arrays, or None."""
-        ...
-
-    def shapes(self, batch: int) -> Mapping[str, jax.ShapeDtypeStruct]:
-        """Return the shapes of a batch of examples, for compilation without data."""
-        ...
-
-    def keys(self, key: Key[Array, ""], batch: int) -> Key[Array, " *keys"]:
-        """Return the random keys of each sample."""
-        ...
-
-    def loss(
-        self, networks: Any, batch: Batch, keys: Key[Array, " *keys"]
-    ) -> tuple[jax.Array, Metrics]:
-        """Return the mean loss of a batch, and further metrics to log."""
-        ...
-
-    def validate(self, networks: Any, batch: Batch) -> Metrics:
-        """Return deterministic metrics of each sample; they depend only on it and its `record`."""
-        ...
-
-    def flops(self, samples: int) -> float:
-        """Return the model FLOPs of an update on `samples` samples; NaN if unknown."""
-        ...
-
-
-class Roles(NamedTuple):
-    """Networks of a distillation. They share the weights that are not trained."""
-
-    student: Any
-    """Networks that are trained."""
-    average: Any
-    """Networks with the moving average of the student's weights; the student without one."""
-    teacher: Any
-    """Networks that do not change."""
-    critic: Any
-    """Networks that learn what the student makes; None without a critic."""
-
-
-@runtime_checkable
-class Distillation(Task, Protocol):
-    """Task of a student that learns from a teacher; its `loss` takes `Roles` for the networks."""
-
-    critic: CriticConfig | None
-    """Training of the critic; None: no critic."""
-
-    def critic_loss(
-        self, roles: Roles, batch: Batch, keys: Key[Array, " *keys"]
-    ) -> tuple[jax.Array, Metrics]:
-        """Return the critic's mean loss of a batch, and further metrics to log."""
-        ...
-
-
-class Stage(NamedTuple):
-    """One training of a recipe: its task and its hyper-parameters."""
-
-    task: Task
-    """Networks, examples and loss."""
-    training: TrainConfig
-    """Its hyper-parameters."""
 
 
 @no_type_check
@@ -412,9 +323,7 @@ class Programs:
             lambda leaf: jax.ShapeDtypeStruct(leaf.shape, task.frozen_dtype), frozen
         )
 
-        def create(
-            loaded: nnx.State | None = None, teacher: nnx.State | None = None
-        ) -> TrainState:
+        def create(loaded: nnx.State | None = None, teacher: nnx.State | None = None) -> TrainState:
             new = nnx.state(task.networks(nnx.Rngs(training.seed)), task.trained)
             params = new if loaded is None else nnx.merge_state(new, loaded)
             state = TrainState.create(params, training.optimizer)

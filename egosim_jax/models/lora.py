@@ -193,7 +193,7 @@ def state_of(path: Path, abstract: nnx.State) -> nnx.State:
     Raises `InputError` unless the file has exactly the low-rank weights of `abstract`.
     """
     leaves = [item for item in nnx.to_flat_state(abstract) if isinstance(item[1], LowRankParam)]
-    # A path in a file has neither the network's name nor that of the layer's low-rank part.
+    # A path in a file has no names of the network and of the layer's low-rank part.
     wanted = {".".join(map(str, (*path[1:-2], path[-1]))): (path, leaf) for path, leaf in leaves}
     tensors = read_safetensors(path)
     shapes = {name: tuple(leaf.shape) for name, (_, leaf) in wanted.items()}

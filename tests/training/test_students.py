@@ -14,9 +14,10 @@ from egosim_jax.configs.model import Networks
 from egosim_jax.models.chunks import Chunks
 from egosim_jax.train import recipes
 from egosim_jax.train.config import CriticConfig, OptimizerConfig, TrainConfig
+from egosim_jax.train.task import Roles
 from egosim_jax.train.tasks.consistency import Consistency
 from egosim_jax.train.tasks.matching import Matching
-from egosim_jax.train.update import Programs, Roles
+from egosim_jax.train.update import Programs
 from egosim_jax.types import InputError, VideoSpec
 
 DEBUG = configs.get("debug")
@@ -139,7 +140,7 @@ class Number(nnx.Module):
 class Following:
     """Task of a number that follows its critic, which follows twice the teacher."""
 
-    critic: CriticConfig = CriticConfig(updates=3, optimizer=OptimizerConfig(learning_rate=0.1))
+    critic = CriticConfig(updates=3, optimizer=OptimizerConfig(learning_rate=0.1))
     trained = nnx.Param
     frozen_dtype = "float32"
 

@@ -1,8 +1,8 @@
 """Causal consistency distillation: a student predicts the data at any noise level in one step.
 
-The times are those of a sampler of `points` steps. For a drawn time t and the next one, s, the
+A sampler of `points` steps visits the times. For a drawn time t and the next one, s, the
 teacher takes the sampler's step from x_t to x_s. The student's prediction of the data at x_t
-learns to equal the prediction at x_s by the moving average of its own weights:
+learns to equal the prediction at x_s by the moving average of the weights:
 
     mean w | f(x_t, t) - f_average(x_s, s) |^2,    f(x, 0) = x
 
@@ -23,8 +23,8 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from egosim_jax.generation.causal import chunks_of
+from egosim_jax.train.task import Batch, Metrics, Roles
 from egosim_jax.train.tasks.denoising import Denoising, condition_of, denoising, loss_weights
-from egosim_jax.train.update import Batch, Metrics, Roles
 from egosim_jax.types import InputError
 
 
@@ -91,9 +91,7 @@ class Consistency(Denoising):
         """Return the model FLOPs of an update: the denoiser's, and two passes without gradient."""
         return super().flops(samples) + 2 * samples * self.forward().total
 
-    def _times(
-        self, keys: Key[Array, " b"]
-    ) -> tuple[Float[Array, "b f"], Float[Array, "b f"]]:
+    def _times(self, keys: Key[Array, " b"]) -> tuple[Float[Array, "b f"], Float[Array, "b f"]]:
         """Draw a time of each chunk, and the next one of the sampler, for each latent frame."""
         chunks = chunks_of(self.model)
         count = len(chunks.sizes)

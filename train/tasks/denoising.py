@@ -26,7 +26,7 @@ from egosim_jax.diffusion.objective import Objective
 from egosim_jax.diffusion.process import DenoiseFn
 from egosim_jax.generation.encoding import encode_condition
 from egosim_jax.models import CausalDenoiser, CausalDenoiserConfig, Flops, lora
-from egosim_jax.train.update import Batch, Metrics
+from egosim_jax.train.task import Batch, Metrics
 from egosim_jax.types import InputError
 
 VALIDATION_SIGMAS = (0.2, 0.5, 0.8, 0.97)

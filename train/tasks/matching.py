@@ -32,8 +32,8 @@ from egosim_jax.diffusion.solver import Visited, integrate_visiting
 from egosim_jax.generation.causal import chunks_of
 from egosim_jax.models import CausalDenoiser, CausalDenoiserConfig
 from egosim_jax.train.config import CriticConfig
+from egosim_jax.train.task import Batch, Metrics, Roles
 from egosim_jax.train.tasks.denoising import Denoising, condition_of, loss_weights
-from egosim_jax.train.update import Batch, Metrics, Roles
 from egosim_jax.types import InputError
 
 MATCHED_TIMES = 0.02, 0.98
@@ -253,13 +253,15 @@ class Matching(Denoising):
         noise = jax.vmap(lambda k: jax.random.normal(k, clip.shape[1:]))(own[:, 1])
         noisy = process.add_noise(clip, noise, time.reshape(-1, 1, 1, 1, 1))
         real, fake = (
-            self._data(noisy, self._whole(dit, condition, clip)(noisy, process.timesteps(time)), time)
+            self._data(
+                noisy, self._whole(dit, condition, clip)(noisy, process.timesteps(time)), time
+            )
             for dit in (roles.teacher.dit, roles.critic.dit)
         )
         error = jnp.abs(clip - real).mean(axis=(1, 2, 3, 4), keepdims=True)
         return jax.lax.stop_gradient((fake - real) / jnp.maximum(error, np.float32(1e-5)))
 
 
-def _at(steps: Float[Array, "s b *x"], step: Array) -> Float[Array, "b *x"]:
+def _at(steps: Float[Array, "s b *x"], step: Array) -> Float[Array, b * x]:
     """Return each sample's entry of a step."""
     return steps[step, jnp.arange(steps.shape[1])]

@@ -1,6 +1,5 @@
 """A student that is a LoRA in its teacher's folder of weights."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -46,7 +45,9 @@ def load(config, folder):
 def test_a_folder_has_a_teacher_and_its_student(folder):
     tensors = weights.read_safetensors(folder / weights.STUDENT)
     down, up = (tensors[f"blocks.self_attn.q.{name}"].array() for name in ("down", "up"))
-    teacher, student = (dict(nnx.to_flat_state(nnx.state(load(c, folder)))) for c in (TEACHER, STUDENT))
+    teacher, student = (
+        dict(nnx.to_flat_state(nnx.state(load(c, folder)))) for c in (TEACHER, STUDENT)
+    )
     for path, leaf in teacher.items():
         change = down @ up if path == ("blocks", "self_attn", "q", "kernel") else 0
         np.testing.assert_allclose(student[path].get_value(), leaf.get_value() + change, atol=1e-6)
@@ -56,7 +57,10 @@ def test_a_folder_has_a_teacher_and_its_student(folder):
     ("changes", "message"),
     [
         ({"base": "0" * 64}, "trained on"),
-        ({"chunks": Chunks(sizes=(2, 1))}, re.escape("needs a causal student with chunks of '1 + 2'")),
+        (
+            {"chunks": Chunks(sizes=(2, 1))},
+            "needs a causal student",
+        ),
     ],
 )
 def test_a_lora_of_other_weights_or_chunks_is_refused(folder, changes, message, tmp_path):
