@@ -24,7 +24,7 @@ from typing import Any, NamedTuple, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from egosim_jax.conditioning import Condition
 from egosim_jax.diffusion.objective import Objective
@@ -250,18 +250,17 @@ class Matching(Denoising):
         low, high = MATCHED_TIMES
         position = low + (high - low) * jax.vmap(jax.random.uniform)(own[:, 0])
         time = process.warp(position)
+        timesteps = process.timesteps(time)
         noise = jax.vmap(lambda k: jax.random.normal(k, clip.shape[1:]))(own[:, 1])
         noisy = process.add_noise(clip, noise, time.reshape(-1, 1, 1, 1, 1))
         real, fake = (
-            self._data(
-                noisy, self._whole(dit, condition, clip)(noisy, process.timesteps(time)), time
-            )
+            self._data(noisy, self._whole(dit, condition, clip)(noisy, timesteps), time)
             for dit in (roles.teacher.dit, roles.critic.dit)
         )
         error = jnp.abs(clip - real).mean(axis=(1, 2, 3, 4), keepdims=True)
         return jax.lax.stop_gradient((fake - real) / jnp.maximum(error, np.float32(1e-5)))
 
 
-def _at(steps: Float[Array, "s b *x"], step: Array) -> Float[Array, b * x]:
+def _at(steps: Float[Array, "s b *x"], step: Int[Array, " b"]) -> Float[Array, " *x"]:
     """Return each sample's entry of a step."""
     return steps[step, jnp.arange(steps.shape[1])]
