@@ -261,6 +261,6 @@ class Matching(Denoising):
         return jax.lax.stop_gradient((fake - real) / jnp.maximum(error, np.float32(1e-5)))
 
 
-def _at(steps: Float[Array, "s b *x"], step: Int[Array, " b"]) -> Float[Array, " *x"]:
+def _at(steps: Float[Array, "s b f h w z"], step: Int[Array, " b"]) -> Float[Array, "b f h w z"]:
     """Return each sample's entry of a step."""
     return steps[step, jnp.arange(steps.shape[1])]
