@@ -180,6 +180,7 @@ def _update_critic(
 ) -> tuple[Any, Metrics]:
     """Return the critic's state after its updates on a batch, each with its own noise."""
     config: Any = task.critic
+    before: Any = state.critic
     steps = config.updates * training.steps
     own = replace(training, optimizer=config.optimizer, steps=steps)
 
@@ -192,7 +193,7 @@ def _update_critic(
         keys = task.keys(jax.random.fold_in(key, number), size)
         return advance(critic, loss, batch, keys, own)
 
-    critic, rows = jax.lax.scan(step, state.critic, jnp.arange(1, config.updates + 1))
+    critic, rows = jax.lax.scan(step, before, jnp.arange(1, config.updates + 1))
     means = {f"critic_{name}": rows[name].mean() for name in ("loss", "grad_norm")}
     return critic, means
 
