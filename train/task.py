@@ -80,6 +80,11 @@ class Distillation(Task, Protocol):
     critic: CriticConfig | None
     """Training of the critic; None: no critic."""
 
+
+@runtime_checkable
+class Criticized(Distillation, Protocol):
+    """Distillation that can have a critic."""
+
     def critic_loss(
         self, roles: Roles, batch: Batch, keys: Key[Array, " *keys"]
     ) -> tuple[jax.Array, Metrics]:

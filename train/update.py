@@ -24,7 +24,7 @@ from jaxtyping import Array, Key
 
 from egosim_jax.sharding import batch_sharding, check_batch, constrain, state_sharding
 from egosim_jax.train.config import OptimizerConfig, TrainConfig, learning_rate, make_optimizer
-from egosim_jax.train.task import Batch, Distillation, Metrics, Roles, Task
+from egosim_jax.train.task import Batch, Criticized, Distillation, Metrics, Roles, Task
 
 GUARD_WARMUP = 50
 """Updates before the guard compares a gradient norm with the running mean."""
@@ -125,7 +125,7 @@ def make_update(
         key = jax.random.fold_in(jax.random.key(training.seed), state.step)
         size = next(iter(batch.values())).shape[0]
         metrics: Metrics = {}
-        if isinstance(task, Distillation) and task.critic is not None:
+        if isinstance(task, Criticized) and task.critic is not None:
             critic, metrics = _update_critic(task, graph, training, state, frozen, batch, key)
             state = replace(state, critic=critic)
 
@@ -170,7 +170,7 @@ def advance(
 
 
 def _update_critic(
-    task: Distillation,
+    task: Criticized,
     graph: nnx.GraphDef,
     training: TrainConfig,
     state: TrainState,

@@ -39,12 +39,6 @@ class Consistency(Denoising):
     def critic(self) -> None:
         """None: there is no critic."""
 
-    def critic_loss(
-        self, roles: Roles, batch: Batch, keys: Key[Array, "b 2"]
-    ) -> tuple[jax.Array, Metrics]:
-        """Raise, because there is no critic."""
-        raise NotImplementedError
-
     def __post_init__(self) -> None:
         """Also raise `InputError` for a model without chunks, and for fewer than two points."""
         super().__post_init__()
