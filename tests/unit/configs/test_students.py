@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from egosim_jax import configs
 from egosim_jax.configs.model import Networks, metadata_of
 from egosim_jax.io import weights
 from egosim_jax.models import lora
@@ -69,6 +70,16 @@ def test_a_lora_of_other_weights_or_chunks_is_refused(folder, changes, message, 
     write(tmp_path, **{"base": weights.hashes(folder)["dit"], **changes})
     with pytest.raises(InputError, match=message):
         load(STUDENT, tmp_path)
+
+
+def test_the_package_has_a_student_next_to_its_teacher():
+    folder = configs.weights_of("tabletop_student", None)
+    assert folder == configs.weights_of("tabletop", None)
+    file = folder / weights.STUDENT
+    assert file.stat().st_size < 8e6
+    wanted = metadata_of("dit", configs.get("tabletop_student").chunks)
+    assert weights.student_of(folder / "dit.safetensors", wanted) == file
+    assert weights.student_of(folder / "dit.safetensors", {}) is None
 
 
 def test_a_teacher_alone_is_no_student(folder, tmp_path):
