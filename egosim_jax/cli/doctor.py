@@ -79,7 +79,7 @@ class Doctor:
     def _folders(self) -> list[Path]:
         from egosim_jax import configs
 
-        shipped = (configs.shipped_weights(name) for name in configs.names())
+        shipped = dict.fromkeys(configs.shipped_weights(name) for name in configs.names())
         return [*(folder for folder in shipped if folder), *(self.weights or _default_folders())]
 
 

@@ -35,6 +35,7 @@ from egosim_jax.models import (
     VideoCodec,
     VideoCodecConfig,
     abstract,
+    lora,
 )
 from egosim_jax.models.chunks import Chunks
 from egosim_jax.models.layers import init_sharded
@@ -334,16 +335,19 @@ class Networks(nnx.Module):
 
         On a mesh, each device reads only its own part of the weights. Raises `InputError` with
         every path that is missing, unknown or of another shape, or if the denoiser makes other
-        chunks.
+        chunks. A student may be a LoRA of the folder's denoiser, in `student.safetensors`.
         """
         networks, folder = cls.abstract(config, only=only), Path(folder)
         if not folder.is_dir():
             raise InputError(f"{folder} is not a folder of weights. (--weights)")
         for name, network in networks.parts().items():
             file = folder / f"{name}.safetensors"
+            student = None
             if name == "dit" and file.is_file():
-                weights.check_chunks(file, metadata_of("dit", config.chunks).get(weights.CHUNKS))
+                student = weights.student_of(file, metadata_of(name, config.chunks))
             weights.load(file, network, mesh=mesh)
+            if student is not None:
+                lora.merge(network, student, base=weights.hashes(folder, only=["dit"])["dit"])
         return networks
 
     def save(self, folder: Path, *, dtype: str | None = None) -> None:

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from flax import nnx
     from jax.sharding import Mesh
 
+STUDENT = "student.safetensors"
+"""Name of the LoRA in a weights folder that makes its denoiser a causal student."""
 CHUNKS = "chunks"
 """Metadata of a denoiser that is a causal student: the latent frames of its chunks."""
 MAX_LISTED = 12
@@ -225,6 +227,21 @@ def _read(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise _absent(path)
     return read_safetensors(path)
+
+
+def student_of(file: Path, metadata: Mapping[str, str]) -> Path | None:
+    """Return the LoRA next to a denoiser's file that makes it the wanted causal student, or None.
+
+    `metadata` is the wanted student's. Raises `InputError` unless the file itself or the LoRA makes
+    the wanted chunks.
+    """
+    wanted, student = metadata.get(CHUNKS), file.with_name(STUDENT)
+    if wanted is None or read_metadata(file).get(CHUNKS) == wanted or not student.is_file():
+        check_chunks(file, wanted)
+        return None
+    check_chunks(file, None)  # the base makes clips at once
+    check_chunks(student, wanted)
+    return student
 
 
 def check_chunks(file: Path, wanted: str | None) -> None:

@@ -42,7 +42,8 @@ from egosim_jax.preflight.report import compile_for
 from egosim_jax.preflight.targets import GIB, compile_offline, find, peak
 from egosim_jax.sharding import batch_sharding, make_mesh
 from egosim_jax.train import recipes
-from egosim_jax.train.update import Programs, Stage
+from egosim_jax.train.task import Stage
+from egosim_jax.train.update import Programs
 from egosim_jax.types import MeshConfig
 
 BFLOAT16 = 4e-3

@@ -21,6 +21,7 @@ def test_every_config_knows_its_own_name():
         "egosim_1_3b",
         "real_tiny",
         "tabletop",
+        "tabletop_student",
     ]
     assert [configs.get(name).name for name in configs.names()] == configs.names()
 
