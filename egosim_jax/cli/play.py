@@ -64,7 +64,6 @@ class Play:
         self._check_port()
         from egosim_jax import configs
         from egosim_jax.generation.generator import Generator
-        from egosim_jax.generation.stream import Streamer
         from egosim_jax.interactive.env.action_spec import ActionSpec
         from egosim_jax.interactive.env.backends import GeneratedWorld
         from egosim_jax.interactive.play.played_episode import PlayedEpisode
@@ -82,9 +81,8 @@ class Play:
         )
         weights = configs.weights_of(self.config, self.weights)
         generator = Generator.load(config, weights)
-        streamer = Streamer(generator)
         world = GeneratedWorld(
-            generator=streamer,
+            generator=generator,
             video=generator.config.video,
             perception=self.perception,
             trained_on=configs.trained_on(self.config, weights),
@@ -93,7 +91,7 @@ class Play:
         start = self._start(world, spec)
         if note := configs.scene_warning(world.trained_on, start.state.provenance):
             print(note, file=sys.stderr, flush=True)
-        streamer.compile()
+        generator.compile(1, streamed=True)
 
         def begin(seed: int) -> PlayedEpisode:
             check_seed(seed, name="table")

@@ -53,7 +53,6 @@ def load_backend(
 
     from egosim_jax import configs
     from egosim_jax.generation.generator import Generator
-    from egosim_jax.generation.stream import Streamer
     from egosim_jax.interactive.env.backends import GeneratedWorld
     from egosim_jax.interactive.env.batching import Batcher
     from egosim_jax.interactive.env.true_world import TrueWorld
@@ -68,11 +67,11 @@ def load_backend(
         raise InputError(f"There is no world {world!r:.40}: it must be 'generated' or 'true'.")
     mesh = make_mesh(MeshConfig(data=-1, fsdp=1))
     folder = configs.weights_of(config, None if weights is None else Path(weights))
-    generator = Streamer(Generator.load(model, folder, mesh=mesh))
+    generator = Generator.load(model, folder, mesh=mesh)
     unit = parts("batch", mesh)
     batcher = Batcher(generator, max_batch=max(batch, unit), unit=unit)
     for size in batcher.sizes if compile else ():
-        generator.compile(size)
+        generator.compile(size, streamed=True)
     return GeneratedWorld(
         generator=batcher,
         video=model.video,

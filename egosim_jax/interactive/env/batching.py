@@ -27,7 +27,7 @@ from egosim_jax.types import Action, InputError, Triplet, View, check_counts, ch
 
 @runtime_checkable
 class BatchGenerator(VideoGenerator, Protocol):
-    """Generator of several clips in one program (`generation.stream.Streamer`)."""
+    """Generator of several clips in one program (`generation.generator.Generator`)."""
 
     renderer: Renderer
     point_px: int
