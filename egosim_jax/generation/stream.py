@@ -74,12 +74,8 @@ class CodecPrograms:
 
     def __init__(self, config: ModelConfig, codec: Any, mesh: Mesh | None = None):
         self.config = config
-        self._encode = CompiledFn(
-            _encode_next, codec, mesh=mesh, cache_key=("encode next", config)
-        )
-        self._decode = CompiledFn(
-            _decode_next, codec, mesh=mesh, cache_key=("decode next", config)
-        )
+        self._encode = CompiledFn(_encode_next, codec, mesh=mesh, cache_key=("encode next", config))
+        self._decode = CompiledFn(_decode_next, codec, mesh=mesh, cache_key=("decode next", config))
 
     def encode(
         self, videos: dict[str, Any], caches: Any
