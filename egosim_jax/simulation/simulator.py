@@ -28,6 +28,10 @@ from egosim_jax.state.tsdf import Fusion
 from egosim_jax.types import Action, Clip, InputError, SceneState, View
 
 UpdateEvery = Literal["clip", "chunk"]
+Show = Callable[[UInt8[np.ndarray, "g h w 3"]], None]
+"""Callback for each decoded group of frames."""
+BY_STEP = ("oracle", "recorded")
+"""Perception pipelines that know the clips by the steps of the state."""
 
 
 @runtime_checkable
@@ -96,7 +100,7 @@ class Latency:
 class FrameTimer:
     """Callback for each decoded group of frames that measures their latency."""
 
-    show: Callable[[UInt8[np.ndarray, "g h w 3"]], None] | None = None
+    show: Show | None = None
     """Callback to call too."""
     since: float = field(default_factory=time.monotonic)
     """Time of the action."""
@@ -143,7 +147,7 @@ class Simulator:
     """Frame rate of the clips, in frames per second."""
     fusion: Fusion = field(default_factory=Fusion)
     """Settings of the fusion."""
-    show: Callable[[UInt8[np.ndarray, "g h w 3"]], None] | None = None
+    show: Show | None = None
     """Callback for each decoded group of frames."""
     update_every: UpdateEvery = "clip"
     """Update of the state after each clip, or after each chunk of a clip."""
@@ -267,10 +271,13 @@ class OpenClip:
         """Frames of the chunks that were taken."""
         return np.concatenate(self._frames)
 
-    def put(self, action: Action) -> None:
-        """Begin the next chunk, from the cameras and hands of its frames; do not wait for it."""
+    def put(self, action: Action, show: Show | None = None) -> None:
+        """Begin the next chunk, from the cameras and hands of its frames; do not wait for it.
+
+        `show` replaces the simulator's callback for the chunk.
+        """
         simulator = self.simulator
-        timer = FrameTimer(simulator.show)
+        timer = FrameTimer(show or simulator.show)
         view = simulator.render(self.state, action)
         if self._stream is None:
             image = view.frames[0] if self._first_frame is None else self._first_frame
@@ -360,3 +367,21 @@ def _join_views(views: list[View]) -> View:
     """Return the view of consecutive frames."""
     names = ("frames", "mask", "depth_m", "object_ids")
     return View(**{name: np.concatenate([getattr(v, name) for v in views]) for name in names})
+
+
+def check_update_every(
+    update_every: UpdateEvery, chunk_frames: tuple[int, ...], name: str, perception: str | None
+) -> None:
+    """Raise `InputError` if a model or a perception cannot update the state by chunk."""
+    if update_every == "clip":
+        return
+    if len(chunk_frames) == 1:
+        raise InputError(
+            f"{name} makes clips at once, so a clip has no chunks after which the state could be "
+            "updated: give a causal student, or --update-every clip. (--update-every)"
+        )
+    if (perception or "").split()[:1] in [[pipeline] for pipeline in BY_STEP]:
+        raise InputError(
+            f"--perception {perception} knows the clips by number, so it cannot update the state "
+            "after each chunk: give --update-every clip. (--update-every)"
+        )

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from egosim_jax.rendering import Renderer
-from egosim_jax.simulation.simulator import VideoGenerator
+from egosim_jax.simulation.simulator import ClipStream, VideoGenerator
 from egosim_jax.types import Action, InputError, Triplet, View, check_counts, check_seed
 
 
@@ -46,6 +46,15 @@ class BatchGenerator(VideoGenerator, Protocol):
 
     def fingerprint(self) -> str:
         """Return the content hash of the config and weights."""
+        ...
+
+    @property
+    def chunk_frames(self) -> tuple[int, ...]:
+        """Frames of each chunk of a clip."""
+        ...
+
+    def begin(self, first_frame: UInt8[np.ndarray, "h w 3"], seed: int) -> ClipStream:
+        """Begin a clip whose conditions are given chunk by chunk."""
         ...
 
 
@@ -118,6 +127,15 @@ class Batcher:
     def fingerprint(self) -> str:
         """Return the generator's content hash; batching does not change a clip."""
         return self._fingerprint
+
+    @property
+    def chunk_frames(self) -> tuple[int, ...]:
+        """Frames of each chunk of a clip."""
+        return self._generator.chunk_frames
+
+    def begin(self, first_frame: UInt8[np.ndarray, "h w 3"], seed: int) -> ClipStream:
+        """Begin a clip whose conditions are given chunk by chunk; it is not batched."""
+        return self._generator.begin(first_frame, seed)
 
     @contextmanager
     def announced(self) -> Iterator[None]:

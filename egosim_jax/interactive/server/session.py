@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import shutil
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -40,6 +40,7 @@ from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.run import write_json
 from egosim_jax.simulation.actions import load_placed, save_placed
 from egosim_jax.simulation.rollout import Rollout, load_clip
+from egosim_jax.simulation.simulator import Show
 from egosim_jax.simulation.start import Start
 from egosim_jax.state import snapshot
 from egosim_jax.types import Action, Cameras, InputError, SceneState
@@ -48,8 +49,6 @@ SETTINGS, CLOSED = "session.json", "closed.json"
 INFO, REQUEST, ACTION = "info.json", "request.json", "action"
 ACTION_FILE = f"{ACTION}.npz"
 FIRST = "first"
-Show = Callable[[UInt8[np.ndarray, "g h w 3"]], None]
-"""Callback for each decoded group of frames."""
 DAMAGE = (InputError, OSError, ValueError, KeyError, TypeError, IndexError)
 """Errors that reading a damaged session can raise."""
 

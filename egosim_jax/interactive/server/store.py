@@ -34,7 +34,6 @@ from egosim_jax.interactive.server.session import (
     SETTINGS,
     Result,
     Session,
-    Show,
     check_world,
     request_hash,
 )
@@ -42,6 +41,7 @@ from egosim_jax.io.atomic import atomic_write, lock_folder
 from egosim_jax.io.bounded import quote, quote_path
 from egosim_jax.runtime.terminal import printable
 from egosim_jax.simulation.episode import Episode
+from egosim_jax.simulation.simulator import Show
 from egosim_jax.simulation.start import Start, check_size
 from egosim_jax.types import InputError, check_counts
 

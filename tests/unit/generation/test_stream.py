@@ -1,13 +1,13 @@
 """Clips that are shown while they are made: chunk by chunk, and frames as they are decoded."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 
 from egosim_jax import configs
+from egosim_jax.conditioning.layout import ChannelLayout
 from egosim_jax.configs.model import Networks
 from egosim_jax.generation.encoding import pack, pack_videos
 from egosim_jax.generation.generator import Generator
@@ -90,19 +90,19 @@ def test_conditions_encoded_by_chunk_are_those_encoded_at_once(student, clips):
 
 @pytest.mark.parametrize("packing", ["space", "time", "single"])
 def test_masks_are_packed_by_chunk_as_at_once(packing):
-    layout = replace(DEBUG.layout, mask_packing=packing)
-    if packing == "single":
-        layout = replace(layout, parts=(("noisy", 16), ("mask", 1)))
-    config = SimpleNamespace(layout=layout, grid=DEBUG.grid)
-    masks = 255 * np.random.default_rng(0).integers(0, 2, (17, 16, 24), np.uint8)
-
-    def packed(part, **options):
-        only = SimpleNamespace(mask=part, prior=part, hands=part)
-        return pack_videos([only], config, **options)["mask"]
-
-    parts = [packed(masks[:5]), packed(masks[5:13], continued=True)]
-    parts.append(packed(masks[13:], continued=True))
-    np.testing.assert_array_equal(np.concatenate(parts, axis=1), packed(masks))
+    parts = (("noisy", 16), ("mask", 1 if packing == "single" else 4))
+    layout = ChannelLayout(parts=parts, mask_packing=packing)
+    dit = replace(DEBUG.dit, in_channels=layout.channels)
+    config = replace(DEBUG, layout=layout, dit=dit, video=VideoSpec(frames=17, height=16, width=32))
+    clip = random_triplet(config.video, 0)
+    chunks = split_triplet(clip, (5, 8, 4))
+    packed = [
+        pack_videos([part], config, continued=number > 0)["mask"]
+        for number, part in enumerate(chunks)
+    ]
+    np.testing.assert_array_equal(
+        np.concatenate(packed, axis=1), pack_videos([clip], config)["mask"]
+    )
 
 
 def test_conditions_of_another_length_are_refused(student, clips):
