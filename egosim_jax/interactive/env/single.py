@@ -324,7 +324,11 @@ class WorldEnv(gymnasium.Env):
         if self._open is None:
             self._open = running.open(prompt)
         step = self._open
-        step.step(actions)
+        try:
+            step.step(actions)
+        except FloatingPointError:
+            self._open = None  # no part of this clip can follow
+            raise
         about = {"part": step.done, "timing": step.latency}
         if step.left:
             found = running.observation(self._observe)
@@ -332,6 +336,8 @@ class WorldEnv(gymnasium.Env):
                 missing = self.backend.video.frames - len(step.frames)
                 found["frames"] = np.pad(step.frames, ((0, missing), *[(0, 0)] * 3), mode="edge")
             found["row"] = step.row.copy()
+            if "keypoints" in found:
+                found["keypoints"] = self.actions.joints(step.row[None])[0]
             return found, 0.0, False, False, {**running.info(), **about}
         self._open = None
         chunk, made = step.finish()
