@@ -149,8 +149,8 @@ class RemoteSession:
     ) -> dict[str, Any]:
         """Make the next part of the next step, and return its reply.
 
-        The server's description has the rows of each part (`part_rows`); the last part's reply is the
-        step's. After an error the step begins again with the next call.
+        The server's description has the number of rows of each part (`part_rows`). The reply to the
+        last part is the step's. After an error the next call begins the step again.
         """
         part, self._part = self._part + 1, 0
         reply = self._step(rows, show, {"part": part, **fields})
