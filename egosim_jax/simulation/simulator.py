@@ -60,6 +60,7 @@ class StreamedGenerator(VideoGenerator, Protocol):
         ...
 
 
+@runtime_checkable
 class ClipStream(Protocol):
     """Clip that is generated chunk by chunk: conditions in (`put`), frames out (`take`)."""
 
