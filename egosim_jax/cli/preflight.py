@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 class Preflight:
     """Compile `generate` for a machine that need not be present; report if it fits in memory.
 
-    Prints, for encoding, denoising and decoding, or for each chunk of a causal student: memory per device (with the weights of all
-    networks), the largest arrays, collectives, FLOPs and the roofline time. Exit code 1 if a
-    program does not fit.
+    Prints, for encoding, denoising and decoding, or for each chunk of a causal student: memory per
+    device (with the weights of all networks), the largest arrays, collectives, FLOPs and the
+    roofline time. Exit code 1 if a program does not fit.
     """
 
     config: str

@@ -160,7 +160,9 @@ class Generator:
             mesh=mesh,
             cache_key=("decode", config),
         )
-        vae, self.codec, self.denoiser = networks.vae, None, None
+        vae = networks.vae
+        self.codec: CodecPrograms | None = None
+        self.denoiser: ChunkDenoiser | None = None
         if isinstance(vae, CausalCodec):
             self.codec = CodecPrograms(config, vae, mesh)
         if config.chunks is not None:

@@ -15,28 +15,23 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, UInt8
 
 from egosim_jax.conditioning.condition import Condition
 from egosim_jax.conditioning.condition import Name as ConditionName
 from egosim_jax.conditioning.pixels import to_model, to_uint8
 from egosim_jax.configs.model import ModelConfig
-from egosim_jax.generation.causal import chunks_of
+from egosim_jax.generation.causal import ChunkDenoiser, chunks_of
 from egosim_jax.generation.compiled import CompiledFn
 from egosim_jax.generation.encoding import last_32_bits, pack_clip, pack_videos, video_shapes
 from egosim_jax.sharding import fetch, parts
 from egosim_jax.types import Action, InputError, Triplet, View
-
-if TYPE_CHECKING:
-    from jax.sharding import Mesh
-
-    from egosim_jax.generation.generator import Generator
-
 
 VIDEOS = ("prior", "mask", "hands")
 """Fields of a triplet that have frames."""
@@ -117,11 +112,54 @@ class CodecPrograms:
             yield "decode 2", self._decode, (latents, self._decode.shapes(latents, cache)[1])
 
 
+@runtime_checkable
+class Programs(Protocol):
+    """Compiled programs of a model (`generator.Generator`)."""
+
+    config: ModelConfig
+    """Config of the model."""
+    mesh: Mesh | None
+    """Mesh of the devices."""
+    encode: CompiledFn
+    """Encoder of conditions."""
+    decode: CompiledFn
+    """Decoder of whole clips."""
+    codec: CodecPrograms | None
+    """Coding of pieces of a clip; None if the codec is not causal."""
+    denoiser: ChunkDenoiser | None
+    """Denoising of chunks; None for a model that makes clips at once."""
+
+    def noise(self, seeds: Sequence[int]) -> Float[Array, "b f h w z"]:
+        """Return the initial noise of each seed."""
+        ...
+
+    def latents(
+        self,
+        triplets: Sequence[Triplet],
+        seeds: Sequence[int],
+        *,
+        without: ConditionName | None = None,
+    ) -> Float[Array, "b f h w z"]:
+        """Return the latents of whole clips."""
+        ...
+
+    def condition(
+        self,
+        view: View,
+        action: Action,
+        first_frame: UInt8[np.ndarray, "h w 3"],
+        *,
+        chunk: int | None = None,
+    ) -> Triplet:
+        """Return the conditions of a chunk of a simulation's clip, by index."""
+        ...
+
+
 class ClipStream:
     """One clip for each seed, chunk by chunk: conditions in (`put`), frames out (`take`)."""
 
     def __init__(
-        self, generator: Generator, seeds: Sequence[int], without: ConditionName | None = None
+        self, generator: Programs, seeds: Sequence[int], without: ConditionName | None = None
     ):
         """Begin clips; `without` drops one condition (`conditioning/condition.py`)."""
         self._generator, self._seeds, self._without = generator, seeds, without
@@ -219,7 +257,7 @@ class ViewStream:
     On a mesh whose devices share a batch, all of them make the same clip.
     """
 
-    def __init__(self, generator: Generator, first_frame: UInt8[np.ndarray, "h w 3"], seed: int):
+    def __init__(self, generator: Programs, first_frame: UInt8[np.ndarray, "h w 3"], seed: int):
         self._generator, self._first_frame = generator, first_frame
         self._copies = 1 if generator.mesh is None else parts("batch", generator.mesh)
         self._clips = ClipStream(generator, [seed] * self._copies)
