@@ -162,7 +162,8 @@ class ClipStream:
         self, generator: Programs, seeds: Sequence[int], without: ConditionName | None = None
     ):
         """Begin clips; `without` drops one condition (`conditioning/condition.py`)."""
-        self._generator, self._seeds, self._without = generator, seeds, without
+        self._generator, self._seeds = generator, seeds
+        self._without: ConditionName | None = without
         self._names: list[str] = []
         self._begun = 0
         self._waiting: deque[Iterable[tuple[Any, Any]]] = deque()
@@ -293,7 +294,8 @@ def _encode_next(codec: CausalCodec, videos: dict[str, Any], caches: Any) -> tup
     found = {
         name: codec.encode_next(to_model(video), before[name]) for name, video in videos.items()
     }
-    return tuple({name: pair[n] for name, pair in found.items()} for n in range(2))
+    latents, after = ({name: pair[n] for name, pair in found.items()} for n in range(2))
+    return latents, after
 
 
 def _decode_next(

@@ -30,7 +30,11 @@ class BatchGenerator(VideoGenerator, Protocol):
     """Generator of several clips in one program (`generation.generator.Generator`)."""
 
     renderer: Renderer
-    point_px: int
+
+    @property
+    def point_px(self) -> int:
+        """Side of the points of a prior in pixels."""
+        ...
 
     def condition(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"]

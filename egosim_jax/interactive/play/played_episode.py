@@ -29,7 +29,7 @@ from egosim_jax.interactive.play.moves import (
     scene_from_state,
     suggest_goal,
 )
-from egosim_jax.interactive.server.parts import Parts
+from egosim_jax.interactive.server.parts import PartResult, Parts
 from egosim_jax.interactive.server.session import Result, Session
 from egosim_jax.rendering.mesh import Side
 from egosim_jax.simulation.actions import places_of
@@ -171,6 +171,7 @@ class PlayedEpisode:
 
         def make(number: int, shown: Callable[[Frames], None]) -> Result:
             row, target, planned = self.row, None, np.zeros((0, 0))
+            result: Result | PartResult | None = None
             for part, count in enumerate(counts, start=1):
                 hand, camera = aim()
                 aimed = hand.row(self.side, camera)
