@@ -93,7 +93,7 @@ class PlayedEpisode:
             row = ready_pose(self.scene, self.goal[0], side).row(side, np.zeros(6))
             start = replace(start, row=np.clip(row, *actions.bounds))
         self.session = Session.create(folder / name, world, actions, start)
-        self._parts = Parts(most=1, idle_s=0)
+        self._parts = Parts(most=1, idle_s=0.0)
         self._filming = ThreadPoolExecutor(1, thread_name_prefix="truth")
         first = self.session.result.frames
         truth: Future[Filmed] | None = None
