@@ -79,7 +79,7 @@ def pack_videos(
 ) -> dict[str, np.ndarray]:
     """Return the arrays of a batch with frames; `continued` ones follow earlier frames of a clip.
 
-    The first frame of a clip is a latent frame of its own, so continued frames number 4k.
+    The first frame of a clip has its own latent frame, so continued frames number 4k.
     """
     layout = config.layout
     videos = {

@@ -276,7 +276,7 @@ class ViewStream:
 
 
 def split_triplet(triplet: Triplet, lengths: Sequence[int]) -> list[Triplet]:
-    """Return the conditions of a clip as those of its chunks, by their numbers of frames."""
+    """Return the conditions of each chunk of a clip, by the numbers of frames of the chunks."""
     ends = np.cumsum(lengths).tolist()
     return [
         replace(

@@ -218,7 +218,7 @@ def slice_action(action: Action, start: int, end: int | None) -> Action:
 
 
 def split_action(action: Action, lengths: Sequence[int]) -> list[Action]:
-    """Return an action as those of its chunks, by their numbers of frames."""
+    """Return the action of each chunk of a clip, by the numbers of frames of the chunks."""
     if len(lengths) == 1:
         return [action]
     ends = np.cumsum(lengths).tolist()

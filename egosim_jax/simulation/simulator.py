@@ -116,7 +116,7 @@ class FrameTimer:
 
     @property
     def latency(self) -> Latency:
-        """Latency of the groups so far, of which there must be one."""
+        """Latency of the groups so far; there must be one."""
         return Latency(first_frame_s=self.times[0], last_frame_s=self.times[-1])
 
 
@@ -208,12 +208,9 @@ class Simulator:
     ) -> Clip:
         """Generate the clip of an action. Raises `InputError` if its shape is not the view's."""
         image = view.frames[0] if first_frame is None else first_frame
-        frames = np.asarray(self._frames(view, action, image, seed))
-        return Clip(frames=self.check(frames, view), fps=self.fps)
+        return Clip(frames=self._frames(view, action, image, seed), fps=self.fps)
 
-    def check(
-        self, frames: UInt8[np.ndarray, "f h w 3"], view: View
-    ) -> UInt8[np.ndarray, "f h w 3"]:
+    def check(self, frames: np.ndarray, view: View) -> UInt8[np.ndarray, "f h w 3"]:
         """Return the generator's frames. Raises `InputError` if their shape is not the view's."""
         if frames.shape != view.frames.shape or frames.dtype != np.uint8:
             raise InputError(
@@ -226,17 +223,16 @@ class Simulator:
         self, view: View, action: Action, image: UInt8[np.ndarray, "h w 3"], seed: int
     ) -> np.ndarray:
         """Return the generator's frames and show them, in groups if the generator streams."""
-        if self.show is None:
-            return self.generator(view, action, image, seed)
-        if not isinstance(self.generator, StreamedGenerator):
-            frames = self.generator(view, action, image, seed)
-            self.show(frames)
+        if self.show is None or not isinstance(self.generator, StreamedGenerator):
+            frames = self.check(np.asarray(self.generator(view, action, image, seed)), view)
+            if self.show is not None:
+                self.show(frames)
             return frames
         groups = []
         for frames in self.generator.stream(view, action, image, seed):
             self.show(frames)
             groups.append(frames)
-        return np.concatenate(groups)
+        return self.check(np.concatenate(groups), view)
 
 
 class OpenClip:
@@ -264,7 +260,7 @@ class OpenClip:
         self._frames: list[UInt8[np.ndarray, "f h w 3"]] = []
 
     def split(self, action: Action) -> list[Action]:
-        """Return the action of a clip as those of its chunks."""
+        """Return the actions of the chunks of a clip's action."""
         return [action] if self.lengths is None else split_action(action, self.lengths)
 
     @property

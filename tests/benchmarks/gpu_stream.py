@@ -87,7 +87,7 @@ def stream(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
 def _split_stream(
     generator: Generator, given: Sequence[Any], seed: int
 ) -> Iterator[dict[str, Any]]:
-    """Yield the seconds of each part of each chunk, each of which waits for the one before."""
+    """Yield the seconds of each part of each chunk. A part waits for the one before."""
     config, codec, denoiser = generator.config, generator.codec, generator.denoiser
     if codec is None or denoiser is None:
         raise SystemExit(f"{config.name} does not stream chunks.")

@@ -210,7 +210,7 @@ class Service:
             found["frames"] = result.frames
         if "keypoints" in observe:
             found["keypoints"] = session.actions.joints(result.row[None])[0]
-        if isinstance(result, PartResult):  # the state is that of the last committed step
+        if isinstance(result, PartResult):  # a part changes no state
             return {**found, "part": result.part, "timing": _timing(result.latency)}
         found["info"] = dict(result.info)
         if "state" in observe:

@@ -126,7 +126,7 @@ def test_the_programs_of_a_student_are_those_it_runs(student, groups):
 
 
 def test_latents_that_are_not_finite_end_the_stream(student, clips, monkeypatch):
-    broken = lambda *_: iter([jnp.full((1, 2, 4, 4, 16), jnp.nan)])  # noqa: E731
+    broken = lambda *_: (jnp.full((1, n, 4, 4, 16), jnp.nan) for n in (2, 1))  # noqa: E731
     monkeypatch.setattr(student.denoiser, "latents", broken)
     with pytest.raises(NonFiniteError, match=clips[0].video_id):
         list(student.groups(clips[:1], [3]))

@@ -314,7 +314,7 @@ class ChunkedPainter:
 
 
 def count_chunks(clip, action, state):
-    """Perception of a clip in which nothing moves; it tells the chunk."""
+    """Perception of a clip in which nothing moves; its note has the chunk."""
     depth_m = np.full(clip.frames.shape[:3], np.inf, np.float32)
     return Perceived(
         step=state.step + 1, frames=clip.frames, cameras=action.cameras, depth_m=depth_m,
