@@ -45,8 +45,19 @@ class Painter:
         return "painter"
 
 
-class BatchPainter(Painter):
+class ChunkPainter(Painter):
+    """Painter of a clip in chunks of 3 and 2 frames; equal actions give the painter's clip."""
+
+    chunk_frames = (3, 2)
+
+    def begin(self, first_frame, seed):
+        return _PaintedChunks(self, np.random.default_rng(seed))
+
+
+class BatchPainter(ChunkPainter):
     """Painter of a batch of clips in the time of one clip."""
+
+    chunk_frames = (5,)
 
     def condition(self, view, action, first_frame):
         return view, action
@@ -59,15 +70,6 @@ class BatchPainter(Painter):
         yield frames[:, :1]
         time.sleep(self.pause)
         yield frames[:, 1:]
-
-
-class ChunkPainter(Painter):
-    """Painter of a clip in chunks of 3 and 2 frames; equal actions give the painter's clip."""
-
-    chunk_frames = (3, 2)
-
-    def begin(self, first_frame, seed):
-        return _PaintedChunks(self, np.random.default_rng(seed))
 
 
 @dataclass
