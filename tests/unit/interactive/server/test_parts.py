@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
+from egosim_jax.interactive.server.client import Client
 from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.interactive.server.store import Limits, Store
 from egosim_jax.types import InputError
 from tests.painted import VIDEO, ChunkPainter, PaintedWorld
-from tests.unit.interactive.server.served import step
+from tests.unit.interactive.server.served import run, step
 
 WORLD = PaintedWorld(generator=ChunkPainter(), video=VIDEO, perception=None)
 
@@ -106,3 +107,19 @@ def test_a_part_that_fails_ends_the_parts(store, monkeypatch):
         part(store, session, 2, given[2:])
     part(store, session, 1, given[:2])
     assert part(store, session, 2, given[2:]).step_id == 1
+
+
+def test_a_client_gives_parts_and_sees_each_before_it_gives_the_next(tmp_path):
+    service, port, _ = run(tmp_path, world=WORLD)
+    with Client(f"ws://127.0.0.1:{port}") as client:
+        assert client.server["part_rows"] == [2, 2]
+        session, shown = client.create(seed=3), []
+        given = session.reply["row"] + np.linspace(0, 0.1, 5)[1:, None] * np.eye(7)[1]
+        first = session.step_part(given[:2], show=shown.append)
+        assert (first["step_id"], first["part"], "info" in first) == (1, 1, False)
+        assert 0 < first["timing"]["first_frames_s"] <= first["timing"]["last_frames_s"]
+        np.testing.assert_array_equal(np.concatenate(shown), first["frames"])
+        done = session.step_part(given[2:], show=shown.append)
+        assert (session.step_id, done["info"]["chunk"]) == (1, 1)
+        np.testing.assert_array_equal(np.concatenate(shown), done["frames"])
+    service.store.close()
