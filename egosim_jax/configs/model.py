@@ -165,6 +165,7 @@ class ModelConfig:
         for option, value, usual in (
             ("guidance.scale", self.guidance.scale, 1.0),
             ("strength", self.strength, None),
+            ("encoding_noise", self.encoding_noise, None),
         ):
             if value != usual:
                 raise InputError(
@@ -238,6 +239,15 @@ class ModelConfig:
     def latent_shape(self) -> tuple[int, int, int]:
         """Frames, rows and columns of a clip's latents."""
         return self.grid.latent_shape(self.video)
+
+    @property
+    def chunk_frames(self) -> tuple[int, ...]:
+        """Frames of each chunk of a clip; a model that makes clips at once has one chunk."""
+        if self.chunks is None:
+            return (self.video.frames,)
+        # The first latent frame of a clip encodes one frame.
+        stride, (first, *others) = self.vae.temporal_stride, self.chunks.sizes
+        return (1 + stride * (first - 1), *(stride * size for size in others))
 
     @property
     def networks(self) -> Mapping[Name, NetworkConfig]:

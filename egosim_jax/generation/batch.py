@@ -30,7 +30,8 @@ from egosim_jax.data.clips import Policy, check_clip, load_triplet
 from egosim_jax.data.metadata import check_presence
 from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.data.windows import RESULTS, Window, conditions_sha256, read_results
-from egosim_jax.generation.generator import Generator, NonFiniteError, batches
+from egosim_jax.generation.generator import Generator, batches
+from egosim_jax.generation.stream import NonFiniteError
 from egosim_jax.io.atomic import append_line
 from egosim_jax.io.bounded import listing, quote
 from egosim_jax.io.decoding import Decoding

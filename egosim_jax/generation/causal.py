@@ -134,12 +134,14 @@ class ChunkDenoiser:
         return run
 
     def programs(
-        self, condition: Condition, noise: Any, *seeds: Any
+        self, text: Any, image: Any, noise: Any, *seeds: Any
     ) -> Iterator[tuple[str, CompiledFn, tuple]]:
         """Yield name, function and input shapes of each program, by the shapes of a clip."""
-        yield "share", self._share, (condition.text, condition.image)
-        shared, cache = self._share.shapes(condition.text, condition.image)
-        channels = jax.eval_shape(self.config.layout.condition_channels, condition, noise)
+        yield "share", self._share, (text, image)
+        shared, cache = self._share.shapes(text, image)
+        layout = self.config.layout
+        width = layout.channels - layout.count("noisy")
+        channels = jax.ShapeDtypeStruct((*noise.shape[:-1], width), noise.dtype)
         for number, (program, size) in enumerate(
             zip(self._denoise, self.chunks.sizes, strict=True)
         ):

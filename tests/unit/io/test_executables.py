@@ -19,7 +19,6 @@ from jax.experimental.compilation_cache import compilation_cache
 from egosim_jax import configs
 from egosim_jax.configs.model import Networks
 from egosim_jax.generation.generator import Generator
-from egosim_jax.generation.stream import Streamer
 from egosim_jax.io import executables, private
 from egosim_jax.io.executables import cached_compile
 
@@ -97,11 +96,11 @@ def test_every_module_that_runs_while_tracing_is_part_of_the_key():
             files.add(frame.f_code.co_filename)
 
     jax.clear_caches()
-    programs = [(function, args) for _, function, args in generator.programs(1)]
-    latents = jax.ShapeDtypeStruct(
-        (1, 1, *config.latent_shape[1:], config.vae.latent_channels), jnp.float32
-    )
-    programs.append((Streamer(generator)._next, (latents, None)))
+    programs = [
+        (function, args)
+        for streamed in (False, True)
+        for _, function, args in generator.programs(1, streamed=streamed)
+    ]
     for function, args in programs:
         sys.setprofile(record)
         try:
