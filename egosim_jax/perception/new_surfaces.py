@@ -3,8 +3,8 @@
 A pixel that no point of the state explains may continue a plane of the background: the table next
 to its observed part, the table under an object that moved away, or the floor. It does if its ray
 meets the plane near observed points of the plane, and its color is one of theirs. A table ends at
-its edge, and the frames show where: beyond it the colors are other ones, or more like those of
-other surfaces. Other sides of a moved object are inside its convex hull. Everything else stays
+its edge, and the frames show where: beyond it the colors are other ones, or closer to another
+surface. Other sides of a moved object are inside its convex hull. Everything else stays
 unknown.
 """
 

@@ -317,7 +317,7 @@ def _support_plane(
 ) -> Float[np.ndarray, " 4"]:
     """Fit the horizontal plane (a, b, c, d) with the most inliers around an object (RANSAC).
 
-    A box beside the object may have more points than the ground, so vertical planes are excluded.
+    A box next to the object may have more points than the ground, so vertical planes are excluded.
     Without a horizontal one, return a plane of unknown height. `up` and `eye_m` as in `upward`.
     """
     distances = np.linalg.norm(others_m - points_m.mean(axis=0), axis=1)

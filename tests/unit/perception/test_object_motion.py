@@ -82,7 +82,7 @@ def test_an_object_without_a_surface_around_it_has_a_horizontal_plane(provenance
     ids=["known", "camera", "camera looking far down"],
 )
 def test_the_side_of_a_box_supports_nothing(up, eye_m):
-    """A wall beside the object has more points than the table."""
+    """A wall next to the object has more points than the table."""
     rng = np.random.default_rng(0)
     table = rng.uniform(-0.1, 0.1, (400, 3)) * [1, 1, 0]
     wall = rng.uniform(-0.1, 0.1, (2000, 3)) * [1, 0, 1] + [0, 0.09, 0.1]
