@@ -3,13 +3,8 @@
 import numpy as np
 import pytest
 
-from egosim_jax.perception.object_motion import (
-    TrackObjects,
-    _support_plane,
-    fall,
-    object_model,
-    snap,
-)
+from egosim_jax.perception.falling import fall, snap
+from egosim_jax.perception.object_motion import TrackObjects, _support_plane, object_model
 from egosim_jax.perception.pose_refinement import ObjectModel, ObjectMotion
 from egosim_jax.types import SceneState
 
