@@ -21,6 +21,8 @@ from egosim_jax.types import Cameras, SceneState
 
 FRAMES = 5
 """Number of compared frames, from the grasp to the end."""
+END_FRAMES = 3
+"""The same for motions of one object with different ends, which differ most in the last frames."""
 SMALLER = 0.1
 """Exponent of a part's relative size in the factor on its cost."""
 WITHOUT_EDGES = 1.2
@@ -109,7 +111,8 @@ def best_of(
     if len(best) == 1:
         return best[0]
     motions = [motion for _, motion in best]
-    costs = predicted_costs(motions, motions[0].model, cameras, state, shown, hidden, color)
+    scene = cameras, state, shown, hidden, color
+    costs = predicted_costs(motions, motions[0].model, *scene, count=END_FRAMES)
     return best[0 if costs is None else int(np.argmin(costs))]
 
 
@@ -174,15 +177,17 @@ def predicted_costs(
     shown: Float32[np.ndarray, "f h w 3"],
     hidden: Bool[np.ndarray, "f h w"],
     color: ColorCost,
+    *,
+    count: int = FRAMES,
 ) -> Float[np.ndarray, " m"] | None:
     """Return how far the scene that each motion predicts is from the clip, in 8-bit levels.
 
-    The support is behind the `whole` cluster. Behind a part of it nothing is known, so these pixels
-    are not compared. If too few are left, the result is None.
+    `count` frames are compared. The support is behind the `whole` cluster. Behind a part of it
+    nothing is known, so these pixels are not compared. If too few are left, the result is None.
     """
     import cv2
 
-    frames = _compared_frames(motions)
+    frames = _compared_frames(motions, count)
     local = replace(cameras, world_from_camera=cameras.world_from_camera[frames])
     shown, hidden = shown[frames], hidden[frames]
     near = _near(motions, state)
@@ -227,10 +232,10 @@ def _closest(
     return np.clip(shown, low, high)
 
 
-def _compared_frames(motions: Sequence[ObjectMotion]) -> Int[np.ndarray, " g"]:
+def _compared_frames(motions: Sequence[ObjectMotion], count: int = FRAMES) -> Int[np.ndarray, " g"]:
     first = min(motion.grasped for motion in motions)
     last = len(motions[0].path) - 1
-    return np.unique(np.rint(np.linspace(first, last, FRAMES + 1)[1:]).astype(int))
+    return np.unique(np.rint(np.linspace(first, last, count + 1)[1:]).astype(int))
 
 
 def _near(motions: Sequence[ObjectMotion], state: SceneState) -> Bool[np.ndarray, " n"]:
