@@ -1,4 +1,4 @@
-"""What a released object does: it falls to the surface below it, or stands on it.
+"""The end of a motion after a release: the object falls to the surface below it, or stands on it.
 
 A perceived height is off by millimeters. So the object's first height above its support is restored
 where it is put down (`snap`).
