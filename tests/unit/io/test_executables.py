@@ -21,6 +21,7 @@ from egosim_jax.configs.model import Networks
 from egosim_jax.generation.generator import Generator
 from egosim_jax.io import executables, private
 from egosim_jax.io.executables import cached_compile
+from tests.flags import devices
 
 GIVEN = (jax.ShapeDtypeStruct((3,), jnp.float32),)
 WIDE = jax.ShapeDtypeStruct((64, 64), jnp.float32)
@@ -352,3 +353,23 @@ def test_what_jaxs_own_cache_has_is_stored_completely(folder, tmp_path):
         jax.config.update(least, before[0])
         jax.config.update("jax_compilation_cache_dir", before[1])
         compilation_cache.reset_cache()
+
+
+ONE_OF_TWO = """
+import jax
+from egosim_jax.io.executables import cached_compile
+from tests.flags import devices
+
+given = (jax.ShapeDtypeStruct((3,), "float32"),)
+compile_fn = lambda: jax.jit(lambda x: 2 * x).lower(*given).compile()  # noqa: E731
+for _ in range(2):
+    print(cached_compile("one of two", given, compile_fn)(jax.numpy.arange(3.0)))
+"""
+
+
+def test_a_function_of_one_device_is_loaded_for_one_of_several(tmp_path):
+    environment = os.environ | devices(2) | {"XDG_CACHE_HOME": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", ONE_OF_TWO], env=environment, capture_output=True, text=True
+    )
+    assert done.stdout == "[0. 2. 4.]\n" * 2, done.stderr
