@@ -129,7 +129,7 @@ def _sharding(leaf: Any) -> str:
     return "" if sharding is None else f"{sharding} {getattr(sharding, 'mesh', '')}"
 
 
-def _devices(args: Any) -> list[jax.Device]:
+def _devices(args: Any) -> list[Any]:
     """Return the devices of a mesh in its order, or the only one that has arguments.
 
     By default, jax would load a function of one device for all devices of the machine.
@@ -137,7 +137,8 @@ def _devices(args: Any) -> list[jax.Device]:
     shardings = [getattr(leaf, "sharding", None) for leaf in jax.tree.leaves(args)]
     for sharding in shardings:
         if isinstance(sharding, jax.sharding.NamedSharding):
-            return list(sharding.mesh.devices.flat)
+            mesh: Any = sharding.mesh
+            return list(mesh.devices.flat)
     used = {device for s in shardings if s is not None for device in s.device_set}
     return list(used) or jax.devices()[:1]
 
