@@ -1,4 +1,4 @@
-"""The end of a motion after a release: the object falls to the surface below it, or stands on it.
+"""Motion of a released object: it falls to the surface below it, or is put down on it.
 
 A perceived height is off by millimeters. So the object's first height above its support is restored
 where it is put down (`snap`).

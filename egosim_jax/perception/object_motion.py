@@ -7,8 +7,8 @@ The candidate that most improves on the object at rest is accepted. If the time 
 unknown, the whole scene that each end predicts decides between the best ends. An object between
 the closing fingertips counts as moved unless the clip clearly shows it at rest. If they hold
 nothing with an id, candidates are grown from the points between them (`growth`), and `extent`
-chooses how far. A released object falls (`fall`) or is put down (`snap`), and `pose_refinement`
-refines its last pose.
+chooses how far. A released object falls or is put down (`falling`), and `pose_refinement` refines
+its last pose.
 """
 
 from __future__ import annotations
