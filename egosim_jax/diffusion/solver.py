@@ -129,7 +129,7 @@ class Visited(NamedTuple):
     """Input of each step."""
     outputs: Float[Array, "s b f h w c"]
     """Prediction of each step."""
-    timesteps: Float[np.ndarray, " s"]
+    timesteps: Float[Array, " s"]
     """Timestep of each step."""
 
 
@@ -157,8 +157,7 @@ def integrate_visiting(
     _, empty = jax.eval_shape(denoise, noise, jnp.zeros(len(noise)))
     empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), empty)
     (state, kept), visited = jax.lax.scan(advance, (solver.start(noise), empty), rows)
-    timesteps = process.timesteps(process.times(steps)[:-1]).astype(np.float32)
-    return state.x, kept, Visited(*visited, timesteps)
+    return state.x, kept, Visited(*visited, timesteps=rows[0])
 
 
 def _rows(

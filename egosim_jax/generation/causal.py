@@ -44,6 +44,12 @@ def chunks_of(config: ModelConfig) -> Chunks:
     return config.chunks
 
 
+def steps_of(config: ModelConfig, number: int) -> Any:
+    """Return the denoising steps of a chunk by number: their number, or the timesteps to visit."""
+    first = chunks_of(config).first_steps
+    return config.steps if number or first is None else first
+
+
 def denoise_chunk(
     dit: CausalDenoiser,
     channels: Float[Array, "b f h w c"],
@@ -67,7 +73,7 @@ def denoise_chunk(
         noise,
         process=config.process,
         solver=config.solver,
-        steps=config.steps if number or chunks.first_steps is None else chunks.first_steps,
+        steps=steps_of(config, number),
         keys=own,
     )
     if number == len(chunks.sizes) - 1:  # no later chunk sees the last one

@@ -29,7 +29,7 @@ from jaxtyping import Array, Float, Int, Key
 from egosim_jax.conditioning import Condition
 from egosim_jax.diffusion.objective import Objective
 from egosim_jax.diffusion.solver import Visited, integrate_visiting
-from egosim_jax.generation.causal import chunks_of
+from egosim_jax.generation.causal import chunks_of, steps_of
 from egosim_jax.models import CausalDenoiser, CausalDenoiserConfig
 from egosim_jax.train.config import CriticConfig
 from egosim_jax.train.task import Batch, Metrics, Roles
@@ -136,7 +136,7 @@ class Matching(Denoising):
                 noise[:, start:end],
                 process=model.process,
                 solver=model.solver,
-                steps=self._visits(number),
+                steps=steps_of(self.model, number),
                 keys=added if model.solver.stochastic else None,
             )
             made.append(Chunk(visited, cache, latents))
@@ -163,7 +163,7 @@ class Matching(Denoising):
         for chunk, (start, end), (step, time) in zip(made, pairwise(bounds), drawn, strict=True):
             context = dit.prepare_chunk(channels[:, start:end], shared, start)
             noisy = _at(chunk.visited.latents, step)
-            timesteps = jnp.asarray(chunk.visited.timesteps)[step]
+            timesteps = chunk.visited.timesteps[step]
             output, _ = dit.denoise_chunk(noisy, timesteps, context, chunk.cache)
             predicted.append(self._data(noisy, output, time))
         return jnp.concatenate(predicted, axis=1)
@@ -197,12 +197,7 @@ class Matching(Denoising):
 
     def _count(self, number: int) -> int:
         """Return the number of denoising steps of a chunk."""
-        return len(self.model.process.times(self._visits(number))) - 1
-
-    def _visits(self, number: int) -> Any:
-        """Return the denoising steps of a chunk: their number, or the timesteps to visit."""
-        first = chunks_of(self.model).first_steps
-        return self.model.steps if number or first is None else first
+        return len(self.model.process.times(steps_of(self.model, number))) - 1
 
     def _condition(self, roles: Roles, batch: Batch, keys: Key[Array, "b 2"]) -> Condition:
         condition = condition_of(roles.student, batch, self.model)
@@ -214,7 +209,7 @@ class Matching(Denoising):
         position = jax.vmap(jax.random.uniform)(own)
         found = []
         for number in range(len(chunks_of(self.model).sizes)):
-            times = self.model.process.times(self._visits(number))[:-1]
+            times = self.model.process.times(steps_of(self.model, number))[:-1]
             times = jnp.asarray(times, jnp.float32)
             count = len(times)
             step = jnp.minimum((position * count).astype(jnp.int32), count - 1)
