@@ -158,7 +158,7 @@ def _rows(folder: Path) -> Iterator[tuple[str, ...]]:
     from egosim_jax.io.mapped import read_metadata
     from egosim_jax.io.weights import hashes
 
-    for network, digest in hashes(folder).items():
+    for network, digest in hashes(folder, student=True).items():
         file = folder / f"{network}.safetensors"
         config = read_metadata(file).get("config", folder.name)
         yield str(folder), config, network, f"{file.stat().st_size / 1e9:.3f}", digest[:16]

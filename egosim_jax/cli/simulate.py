@@ -113,7 +113,7 @@ class Simulate:
         made_of = {
             "simulate": self,
             "model": config,
-            "weights": hashes(weights),
+            "weights": hashes(weights, student=config.chunks is not None),
             "episode": fingerprint(episode),
         }
         Journal(folder, outputs=OUTPUTS)  # refuses a damaged journal before the weights are loaded

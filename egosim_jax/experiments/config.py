@@ -42,7 +42,8 @@ class ModelExperiment:
         config = configs.get(self.config)
         config = replace(config, steps=self.steps or config.steps)
         weights = configs.weights_of(self.config, self.weights)
-        record = {"experiment": self, "model": config, "weights": hashes(weights)}
+        digests = hashes(weights, student=config.chunks is not None)
+        record = {"experiment": self, "model": config, "weights": digests}
         open_folder(self.out, record, mutable=["experiment.weights"])
         return Generator.load(config, weights)
 

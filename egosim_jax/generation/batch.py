@@ -130,7 +130,9 @@ class BatchJob:
     def open(self) -> None:
         """Record the settings in the folder. Raises `InputError` if it has another job's."""
         self._place()
-        digests = None if self.weights is None else hashes(self.weights)
+        student, digests = self.model.chunks is not None, None
+        if self.weights is not None:
+            digests = hashes(self.weights, student=student)
         if self.lora is not None and digests is not None:
             check_base(self.lora, [digests["dit"]])
         settings = {

@@ -113,17 +113,20 @@ def fill(
     nnx.update(module, state)
 
 
-def hashes(folder: Path, *, only: Collection[str] | None = None) -> dict[str, str]:
+def hashes(
+    folder: Path, *, only: Collection[str] | None = None, student: bool = False
+) -> dict[str, str]:
     """Return a hash per network in a weights folder, or per network in `only`.
 
-    Bit-equal weights have the same hash (`weights_hash`).
+    Bit-equal weights have the same hash (`weights_hash`). A student beside its teacher counts only
+    with `student`: what the teacher alone makes does not depend on it.
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a weights folder. (--weights)")
     files = [
         path
         for path in sorted(folder.glob("[!.]*.safetensors"))  # hidden files are incomplete
-        if only is None or path.stem in only
+        if (path.stem in only if only is not None else student or path.name != STUDENT)
     ]
     return {path.stem: read_weights_hash(path) for path in files}
 
