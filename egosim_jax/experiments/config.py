@@ -91,6 +91,38 @@ class Continuous(ModelExperiment):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Students(ModelExperiment):
+    """Compare a causal student with its teacher on held-out scenes, and over consecutive clips.
+
+    The rows: the teacher with several numbers of denoising steps, its weights used chunk by chunk,
+    the given stages of training, and the student. Prints means, the student's differences from each
+    row, and the clips of the loop with `classical` updates. Writes report.json, curves.png and
+    contact_sheet.png. The same command resumes the loop.
+    """
+
+    config: str = "tabletop_student"
+    """Name of the student."""
+    teacher: str = "tabletop"
+    """Name of the teacher, whose weights are in the student's folder."""
+    teacher_steps: tuple[int, ...] = (2, 4, 10)
+    """Denoising steps of the teacher, a row for each."""
+    stages: tuple[str, ...] = ()
+    """Stages of the student's training, each as NAME=FILE; the file is a run's lora.safetensors."""
+    scenes: int = 24
+    """Number of scenes."""
+    first_scene: int = 100
+    """Seed of the first scene; the shipped model was trained on seeds from 1000 on."""
+    batch_size: int = 8
+    """Number of clips generated together."""
+    sequences: int = 12
+    """Number of sequences in the loop; 0: no loop."""
+    first_sequence: int = 600
+    """Seed of the first sequence."""
+    clips: int = 10
+    """Number of clips per sequence."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Update(ModelExperiment):
     """Carry an object in held-out scenes, update the state, and compare it with the ground truth.
 

@@ -11,6 +11,7 @@ from egosim_jax.configs.model import Networks, metadata_of
 from egosim_jax.io import weights
 from egosim_jax.models import lora
 from egosim_jax.models.chunks import Chunks
+from egosim_jax.train import recipes
 from egosim_jax.types import InputError
 from tests.unit.generation.test_causal import DEBUG, network
 
@@ -87,3 +88,10 @@ def test_a_teacher_alone_is_no_student(folder, tmp_path):
     (tmp_path / weights.STUDENT).unlink()
     with pytest.raises(InputError, match="a denoiser of whole clips"):
         load(STUDENT, tmp_path)
+
+
+@pytest.mark.parametrize("name", [name for name in configs.names() if name.endswith("_student")])
+def test_a_students_config_is_what_its_last_stage_trains(name):
+    trained, config = recipes.get(f"{name}_dmd").model(), configs.get(name)
+    assert (trained.chunks, trained.steps) == (config.chunks, config.steps)
+    assert f"{trained.name}_student" == name

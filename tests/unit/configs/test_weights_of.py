@@ -16,7 +16,14 @@ from egosim_jax.io.run import write_json
 from egosim_jax.train import recipes
 from egosim_jax.types import InputError
 
-TRAINED = ("debug", "real_tiny", "dwm_tabletop", "egosim_1_3b")
+TRAINED = (
+    "debug",
+    "real_tiny",
+    "dwm_tabletop",
+    "egosim_1_3b",
+    "egosim_14b_student",
+    "egosim_1_3b_student",
+)
 
 
 @pytest.mark.parametrize("name", TRAINED)
