@@ -33,8 +33,7 @@ def fall(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"], fps: int) -
     if not motion.lands:
         return motion
     up, gap = _gap_below(motion, others_m)
-    first = motion.model.points_m
-    if ((transform(motion.path[motion.released], first) - first) @ up).mean() < MIN_LIFT_M:
+    if _rise(motion, motion.released, up) < MIN_LIFT_M:
         return motion
     seconds = np.maximum(np.arange(len(motion.path)) - motion.released, 0) / fps
     drop = np.minimum(GRAVITY / 2 * seconds**2, max(gap, 0.0))
@@ -46,12 +45,16 @@ def fall(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"], fps: int) -
 def snap(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"]) -> ObjectMotion:
     """Return the motion with a released object at its first height above the surface below it.
 
-    The correction grows from the grasp to the release. Objects that do not `fall` are not snapped,
-    and none whose height differs by more than `SNAP_M`.
+    An object that was never lifted may also keep its height: a drawer hangs in its case, and what
+    is below it is not what it rests on. The smaller correction is made. It grows from the grasp to
+    the release. Objects that do not `fall` are not snapped, and none whose height differs by more
+    than `SNAP_M`.
     """
     if not motion.lands:
         return motion
     up, gap = _gap_below(motion, others_m)
+    if max(_rise(motion, frame, up) for frame in range(len(motion.path))) < MIN_LIFT_M:
+        gap = min(gap, _rise(motion, -1, up), key=abs)
     if abs(gap) > SNAP_M:
         return motion
     path = motion.path.copy()
@@ -71,6 +74,12 @@ def _gap_below(
     # Before the grasp, points above the object's lowest ones are next to it, or left of it.
     under = others_m[others_m @ up < np.quantile(first @ up, 0.02) + FOOTPRINT_M]
     return up, _clearance(end, others_m, up, floor) - _clearance(first, under, up, floor)
+
+
+def _rise(motion: ObjectMotion, frame: int, up: Float[np.ndarray, " 3"]) -> float:
+    """Return how much higher than at first an object is in a frame, in meters."""
+    first = motion.model.points_m
+    return float(((transform(motion.path[frame], first) - first) @ up).mean())
 
 
 def _clearance(

@@ -140,6 +140,14 @@ def test_what_was_put_down_has_its_first_height_above_the_support(end_m, height_
     np.testing.assert_array_equal(path[:5], carried(end_m).path[:5])
 
 
+@pytest.mark.parametrize("rise_m", [0.002, -0.003])
+def test_a_drawer_that_slides_out_of_its_case_keeps_its_height(rise_m):
+    """Its case, and not what it rests on, is below it at first; later it is above the table."""
+    case = np.concatenate([TOP * [0.1, 0.1, 0] + [0, 0, 0.71], TOP]).astype(np.float32)
+    pulled = snap(carried([0, -0.1, rise_m]), case)
+    np.testing.assert_allclose(pulled.path[-1, :3, 3], [0, -0.1, 0], atol=1e-6)
+
+
 @pytest.mark.parametrize(
     "options",
     [{"released": 16}, {"hinged": True}, {"plane": np.array([0, 0, 1, np.nan])}],
