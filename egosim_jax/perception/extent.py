@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from egosim_jax.geometry import cameras_in_object_frame, invert, pixels_of, transform
 from egosim_jax.perception.pose_refinement import ColorCost, ObjectModel, ObjectMotion
 from egosim_jax.rendering.reference import splat
+from egosim_jax.state.fuse import dilate
 from egosim_jax.state.new_objects import is_among
 from egosim_jax.types import Cameras, SceneState
 
@@ -31,6 +32,14 @@ NOISE = 3.0
 """Difference from the clip that means nothing, in 8-bit levels."""
 MIN_KNOWN = 0.25
 """Minimum fraction of the covered pixels that can be compared; fewer decide nothing."""
+UNKNOWN = 4.0
+"""Maximum cost of a pixel whose surface is a guess, and cost if it is unknown, in 8-bit levels."""
+STAYED = 40.0
+"""Cost of such a pixel if it has the color of before, in 8-bit levels: nothing left it."""
+AS_BEFORE = 12.0
+"""Maximum color difference of a pixel that has the color of before, in 8-bit levels."""
+ON_SUPPORT_M = 0.005
+"""Maximum distance of a point of the support from its plane, in meters."""
 MARGIN_M = 0.05
 """Distance around the moved points within which the state is drawn, in meters."""
 POINT_PX = 2
@@ -182,38 +191,71 @@ def predicted_costs(
 ) -> Float[np.ndarray, " m"] | None:
     """Return how far the scene that each motion predicts is from the clip, in 8-bit levels.
 
-    `count` frames are compared. The support is behind the `whole` cluster. Behind a part of it
-    nothing is known, so these pixels are not compared. If too few are left, the result is None.
+    `count` frames are compared. What an object leaves is a guess: the support behind the `whole`
+    cluster, and nothing known behind a part. A part may also bring sides along that it had inside
+    the cluster, as a drawer does; they are seen where it passed over the support. A guess costs
+    little, unless the clip shows the color of before: then nothing left the place. If too little is
+    no guess, the result is None.
     """
-    import cv2
-
     frames = _compared_frames(motions, count)
     local = replace(cameras, world_from_camera=cameras.world_from_camera[frames])
     shown, hidden = shown[frames], hidden[frames]
     near = _near(motions, state)
     points, colors = state.points_m[near], state.colors[near].astype(np.float32)
     ground = _ground_color(motions[0], points, colors)
+    plane = whole.plane
+    on_support = np.append(np.abs(points @ plane[:3] + plane[3]) < ON_SUPPORT_M, False)
     models = {id(motion.model): motion.model for motion in motions}
     rests = {key: _draw_rest(model, local, points) for key, model in models.items()}
     layers = [(*_draw(motion, frames, local), *rests[id(motion.model)]) for motion in motions]
     compared = np.any([layer[1] >= 0 for layer in layers], axis=0)
     everything = np.concatenate([m.points_m for m in models.values()]).astype(np.float32)
     compared |= splat(everything, local, point_px=POINT_PX)[1] >= 0
-    covered = compared & ~hidden
-    compared = covered.copy()
-    predicted = []
+    compared &= ~hidden
+    known = compared.copy()
+    nothing = np.full(3, np.nan, np.float32)
+    _, first = splat(points, local, point_px=POINT_PX)
+    before = _closest(np.append(colors, np.zeros((1, 3), np.float32), axis=0)[first], shown)
+    stayed = (first >= 0) & (np.sqrt(np.square(shown - before).mean(axis=-1)) < AS_BEFORE)
+    found = []
     for motion, (moved_m, moved, rest_m, rest) in zip(motions, layers, strict=True):
-        behind = ground if motion.model is whole else np.full(3, np.nan, np.float32)
-        drawn = np.append(colors, behind[None], axis=0)[rest]
+        is_whole = motion.model is whole
+        drawn = np.append(colors, (ground if is_whole else nothing)[None], axis=0)[rest]
         nearer = (moved >= 0) & (moved_m < rest_m)
         drawn = np.where(nearer[..., None], motion.model.colors[moved], drawn)
-        unknown = np.asarray(np.isnan(drawn).any(axis=-1))
-        compared &= ~np.stack([cv2.dilate(f.astype(np.uint8), SQUARE) > 0 for f in unknown])
-        predicted.append(_closest(np.nan_to_num(drawn), shown))
-    if compared.sum() <= MIN_KNOWN * covered.sum():
+        gaps = color.apart(shown, _closest(np.nan_to_num(drawn), shown))
+        left = (rest == len(points)) & ~nearer
+        guessed = left
+        if not is_whole:
+            guessed = dilate(left, 0.0)
+            known &= ~guessed
+            passed = _passed(motion, frames, local) & on_support[rest] & ~nearer
+            gaps = np.where(left, UNKNOWN, gaps)
+            guessed = guessed | passed
+        gaps = np.where(guessed, np.minimum(gaps, UNKNOWN), gaps)
+        gaps = np.where(left & stayed & (gaps >= UNKNOWN), STAYED, gaps)
+        found.append(np.minimum(gaps, color.max_residual))
+    if known.sum() <= MIN_KNOWN * compared.sum():
         return None
-    costs = [color.mean(shown[compared], drawn[compared]) for drawn in predicted]
-    return np.array(costs)
+    return np.array([gaps[compared].mean() for gaps in found])
+
+
+def _passed(
+    motion: ObjectMotion, frames: Int[np.ndarray, " g"], cameras: Cameras
+) -> Bool[np.ndarray, "g h w"]:
+    """Return the pixels between an object's first place and its place in each frame."""
+    import cv2
+
+    found = np.zeros((len(frames), cameras.height, cameras.width), np.uint8)
+    points = motion.model.points_m
+    for index, frame in enumerate(frames):
+        both = np.concatenate([points, transform(motion.path[frame], points)])
+        one = replace(cameras, world_from_camera=cameras.world_from_camera[index : index + 1])
+        row, column, inside = pixels_of(one, transform(invert(one.world_from_camera), both))
+        corners = np.stack([column[inside], row[inside]], axis=1).astype(np.int32)
+        if len(corners):
+            cv2.fillConvexPoly(found[index], cv2.convexHull(corners), 1)
+    return found > 0
 
 
 def _closest(
@@ -256,7 +298,7 @@ def _ground_color(
 ) -> Float32[np.ndarray, " 3"]:
     """Return the color of the supporting plane; NaN without points on it."""
     plane = motion.model.plane
-    on = np.abs(points_m @ plane[:3] + plane[3]) < 0.005
+    on = np.abs(points_m @ plane[:3] + plane[3]) < ON_SUPPORT_M
     if not on.any():
         return np.full(3, np.nan, np.float32)
     return np.median(colors[on], axis=0).astype(np.float32)
