@@ -34,6 +34,8 @@ MAX_DEPTH_M = 0.06
 """Maximum distance of a grip behind the visible side of the gripped object, in meters."""
 FIT_M = 0.01
 """Error of the width of a gripped object on either side, in meters."""
+MAX_ARC_DEG = 120.0
+"""Maximum angle of a hinge in degrees; jitter of a hand looks like a tighter arc."""
 MIN_ARC_DEG = 25.0
 """Minimum angle of an arc, in degrees; a shorter arc does not determine its axis."""
 MAX_ARC_ERROR = 0.05
@@ -271,7 +273,8 @@ def hinge_motion(
     spokes = flat - [x, y]
     angles = np.unwrap(np.arctan2(spokes[:, 1], spokes[:, 0]))
     off = np.hypot(np.linalg.norm(spokes, axis=1) - radius, (path_m - middle) @ normal)
-    if np.ptp(angles) < np.radians(MIN_ARC_DEG) or off.max() > MAX_ARC_ERROR * radius:
+    turned = np.degrees(np.ptp(angles))
+    if not MIN_ARC_DEG <= turned <= MAX_ARC_DEG or off.max() > MAX_ARC_ERROR * radius:
         return None
     axis = np.cross(across, along)
     center = middle + x * across + y * along

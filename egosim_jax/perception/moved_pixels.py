@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from egosim_jax.geometry import invert, project, transform
 from egosim_jax.types import Cameras
@@ -28,14 +28,21 @@ MAX_LIGHT = 1.35
 """Maximum ratio of the light on a pixel in two frames."""
 PALETTE = 1000
 """Approximate number of an object's colors to which hidden pixels are compared."""
-PASSES = 2
-"""Number of passes of the segmentation; the first takes the hull of the corners as the object."""
+PASSES = 4
+"""Number of passes of the segmentation; the first takes the hull of the corners as the object.
+
+The object that a pass has found hides its own first place in later frames from the next one, and is
+searched beyond its border: a tall cup has corners at its lid alone."""
 UNSEEN = 12.0
 """Assumed color change along the motion of a pixel that hands always hide, in 8-bit levels."""
 HAND_MARGIN = 1 / 280
 """Border around hands that is not compared, in image widths."""
+NOTCH = 0.15
+"""Maximum width of a notch in an object's outline, relative to its extent."""
 AROUND = 2.0
 """Width of the searched border around an object's corners, relative to their extent."""
+BEYOND = 0.5
+"""Width of the searched border around an object of an earlier pass, relative to its extent."""
 
 
 def segment_moved(
@@ -54,19 +61,15 @@ def segment_moved(
     cv2.fillConvexPoly(own, outline, 1)
     own = cv2.erode(own, np.ones((WINDOW_PX // 2 + 1,) * 2, np.uint8))  # corners may be next to it
     chosen = _compared(start, motion)
-    low, high = start.min(axis=0), start.max(axis=0)
-    border = AROUND * (high - low).max() + 4
-    left, top = np.maximum(low - border, 0).astype(int)
-    right, bottom = np.minimum(high + border + 1, own.shape[::-1]).astype(int)
-    rows, columns = (x.reshape(-1) for x in np.mgrid[top:bottom, left:right])
-    pixels = np.stack([columns, rows], axis=1).astype(float)
-    poses = cameras.world_from_camera[[0, *chosen]]
-    resting = resting_places(pixels, replace(cameras, world_from_camera=poses), depth_m)[1:]
+    poses = replace(cameras, world_from_camera=cameras.world_from_camera[[0, *chosen]])
     smooth = [cv2.GaussianBlur(frames[frame], (0, 0), 1.0) for frame in (0, *chosen)]
-    expected = smooth[0][rows, columns].astype(np.float32)
     margin = max(1, round(HAND_MARGIN * own.shape[1]))
     hands = [grown(hidden[frame], margin) for frame in (0, *chosen)]
     for _ in range(PASSES):
+        rows, columns = _searched(start, own)
+        pixels = np.stack([columns, rows], axis=1).astype(float)
+        resting = resting_places(pixels, poses, depth_m)[1:]
+        expected = smooth[0][rows, columns].astype(np.float32)
         changes = np.full((2, len(chosen), len(rows)), np.nan, np.float32)
         for n, frame in enumerate(chosen):
             covered = hands[n + 1] | grown(warp(own > 0, motion[frame]), 2)
@@ -86,6 +89,19 @@ def segment_moved(
         own[rows, columns] = moves & ~hands[0][rows, columns]
         own = _cleaned(own, start)
     return (own > 0) & ~hidden[0]
+
+
+def _searched(
+    start: Float32[np.ndarray, "n 2"], own: UInt8[np.ndarray, "h w"]
+) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
+    """Return rows and columns around the corners and the object; it may be empty."""
+    places = np.concatenate([start, np.argwhere(own)[:, ::-1]])
+    low, high = places.min(axis=0), places.max(axis=0)
+    border = max(BEYOND * (high - low).max(), AROUND * np.ptp(start, axis=0).max()) + 4
+    left, top = np.maximum(low - border, 0).astype(int)
+    right, bottom = np.minimum(high + border + 1, own.shape[::-1]).astype(int)
+    rows, columns = (x.reshape(-1) for x in np.mgrid[top:bottom, left:right])
+    return rows, columns
 
 
 def resting_places(
@@ -135,7 +151,13 @@ def _cleaned(
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     own = cv2.morphologyEx(own, cv2.MORPH_OPEN, kernel)
     own = cv2.morphologyEx(own, cv2.MORPH_CLOSE, kernel, iterations=2)
-    return _filled(_at_corners(own, start))
+    own = _at_corners(own, start)
+    # Notches: where the object has the color of what is behind it, nothing shows that it moves.
+    size = round(NOTCH * np.ptp(np.argwhere(own), axis=0).max()) | 1 if own.any() else 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    around = np.pad(own, size)
+    closed = cv2.morphologyEx(around, cv2.MORPH_CLOSE, kernel)
+    return _filled(closed[size:-size, size:-size].copy())
 
 
 def _compared(start: Float32[np.ndarray, "n 2"], motion: Float[np.ndarray, "f 2 3"]) -> list[int]:
