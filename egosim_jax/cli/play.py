@@ -42,7 +42,7 @@ class Play:
     """Episode whose scene is used, instead of a tabletop scene."""
     hand: Literal["right", "left"] = "right"
     """Hand that acts."""
-    config: str = "tabletop"
+    config: str = "tabletop_student"
     """Name of the model."""
     weights: Path | None = None
     """Folder of weights; by default the shipped or fetched ones."""

@@ -1,10 +1,11 @@
 """Time clips of `egosim play` at the browser, and record the page as a GIF.
 
-    python -m tests.benchmarks.bench_play [--clips 5] [--gif docs/play.gif]
+    python -m tests.benchmarks.bench_play [--clips 5] [--configs tabletop_student tabletop]
+        [--gif docs/play.gif]
 
 Prints, for each clip, the seconds from the click to the first and the last frames that the browser
-has received, and to the state's update; then their medians without the first clip. The recording
-shows the page before one clip, with each of its frames, and after it.
+has received, and to the state's update; then their medians without the first clip, for each config.
+The recording shows the page before one clip, with each of its frames, and after it.
 """
 
 import argparse
@@ -100,22 +101,30 @@ def main():
     """Time clips, then record one."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--clips", type=int, default=5)
+    parser.add_argument("--configs", nargs="+", default=["tabletop_student"])
     parser.add_argument("--gif", type=Path)
     given = parser.parse_args()
+    for config in given.configs:
+        print(config)
+        measure(config, given.clips, given.gif)
+
+
+def measure(config, clips, gif):
+    """Time the clips of a model, after one is recorded if a path is given."""
     with (
         tempfile.TemporaryDirectory() as name,
-        playing(Path(name) / "runs", "--seed", "0") as url,
+        playing(Path(name) / "runs", "--seed", "0", "--config", config) as url,
         browse(url, Path(name), size=(1180, 1000)) as page,
     ):
         page.wait_for_text("put it on the ring")
         time.sleep(3)
-        if given.gif is not None:
-            record(page, Path(name) / "runs", given.gif)
+        if gif is not None:
+            record(page, Path(name) / "runs", gif)
             page.click("undo")
             page.wait_for_text("0: The beginning")
         page.run(WATCH)
         times = []
-        for number in range(given.clips):
+        for number in range(clips):
             times.append(make_clip(page, "put it on the ring" if number % 2 else "lift it"))
             print("first {:.2f} s, last {:.2f} s, state {:.2f} s".format(*times[-1]), flush=True)
             time.sleep(4)  # until it has been played
