@@ -17,6 +17,8 @@ ANGLES = np.radians([0, 30, -30, 60, -60, 90, -90, 135, -135, 180])
 """Directions of the base as seen from the path, from the wearer's, in order of preference."""
 DISTANCES = (0.65, 0.8, 0.5, 0.35)
 """Distances of the base from the middle of the path, in reaches of the arm."""
+Base = tuple[float, float, float, float]
+"""Place in meters and yaw in degrees, in a frame on the table, z upwards."""
 MOMENTS = 6
 """Number of frames of the path that decide where a base is tried."""
 FIRST_STEPS, NEXT_STEPS = 40, 12
@@ -49,12 +51,12 @@ def place(
     world_from_up: Float[np.ndarray, "4 4"],
     eyes_m: Float[np.ndarray, "f 3"],
     fps: int,
-    base: tuple[float, float, float, float] | None = None,
+    base: Base | None = None,
 ) -> Placed:
     """Return the base from which the arm reaches most of the path, and the motion.
 
     `world_from_up` is a frame on the table, z upwards. `eyes_m` are the centers of the camera.
-    `base` is x, y, z and yaw in that frame, in meters and degrees; by default it is searched.
+    By default, `base` is searched.
     """
     up_from_grip = invert(world_from_up) @ grips.world_from_grip
     eyes = (eyes_m - world_from_up[:3, 3]) @ world_from_up[:3, :3]

@@ -1,0 +1,162 @@
+"""Frames without hands: what is behind a hand, from the state or from other frames.
+
+A hidden pixel takes, in this order, what the state shows there, with its objects where they are in
+that frame; what other frames of the clip show; or an inpainted color, which is counted as unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+
+from egosim_jax.geometry import pixel_rays, transform
+from egosim_jax.rendering.reference import add_margin, close_gaps, splat
+from egosim_jax.types import Cameras, GroundTruth, SceneState
+
+MARGIN_PX = 1
+"""Pixels around a hand that are mixed with its color."""
+NEIGHBORS = 8
+"""Number of frames of a clip that others may take colors from."""
+INPAINT_PX = 3
+"""Radius of the inpainting (Telea)."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class Background:
+    """Frames of a clip without hands."""
+
+    frames: UInt8[np.ndarray, "f h w 3"]
+    """Colors."""
+    depth_m: Float32[np.ndarray, "f h w"]
+    """Depth in meters; infinite where it is unknown."""
+    hidden: Bool[np.ndarray, "f h w"]
+    """Mask of the pixels that showed a hand or its edge."""
+    from_state: int
+    """Number of hidden pixels that the state shows."""
+    from_frames: int
+    """Number of hidden pixels that only other frames show."""
+    unknown: int
+    """Number of hidden pixels that nothing shows."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class _Cloud:
+    """Colored points where they are in the first frame of a clip."""
+
+    points_m: Float[np.ndarray, "n 3"]
+    colors: UInt8[np.ndarray, "n 3"]
+    object_ids: Int[np.ndarray, " n"]
+
+    def view(
+        self, cameras: Cameras, motions: Mapping[int, np.ndarray], frame: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return color and depth of a frame, whose objects have moved."""
+        points = self.points_m.astype(float)
+        for number, motion in motions.items():
+            own = self.object_ids == number
+            points[own] = transform(motion[frame], points[own])
+        camera = _one(cameras, frame)
+        depth, index = close_gaps(*splat(points, add_margin(camera), point_px=1))
+        colors = np.concatenate([self.colors, np.zeros((1, 3), np.uint8)])
+        return colors[index[0]], depth[0]
+
+
+def remove_hands(state: SceneState, cameras: Cameras, truth: GroundTruth) -> Background:
+    """Return the frames of a clip without hands, from the state before it and its ground truth.
+
+    The ground truth must have depth and ids. Raises `InputError` if it is for other cameras.
+    """
+    import cv2
+
+    assert truth.depth_m is not None and truth.object_ids is not None
+    motions = truth.motions or {}
+    square = np.ones((2 * MARGIN_PX + 1,) * 2, np.uint8)
+    hands = (truth.object_ids < 0).astype(np.uint8)
+    hidden = np.stack([cv2.dilate(mask, square) for mask in hands]) > 0
+    scene = _Cloud(
+        points_m=state.points_m, colors=state.colors, object_ids=state.object_ids
+    )
+    around = _neighbors(cameras, truth, hidden, motions)
+    frames, depth = truth.frames.copy(), truth.depth_m.copy()
+    counts = np.zeros(3, int)
+    for frame, hole in enumerate(hidden):
+        if not hole.any():
+            continue
+        missing = hole.copy()
+        for source, cloud in enumerate((scene, around)):
+            colors, seen_m = cloud.view(cameras, motions, frame)
+            taken = missing & np.isfinite(seen_m)
+            frames[frame][taken], depth[frame][taken] = colors[taken], seen_m[taken]
+            counts[source] += taken.sum()
+            missing &= ~taken
+            if not missing.any():
+                break
+        counts[2] += missing.sum()
+        depth[frame][missing] = np.inf
+        filled = cv2.inpaint(
+            frames[frame], missing.astype(np.uint8), INPAINT_PX, cv2.INPAINT_TELEA
+        )
+        frames[frame][missing] = filled[missing]
+    from_state, from_frames, unknown = counts.tolist()
+    return Background(
+        frames=frames,
+        depth_m=depth,
+        hidden=hidden,
+        from_state=from_state,
+        from_frames=from_frames,
+        unknown=unknown,
+    )
+
+
+def _neighbors(
+    cameras: Cameras,
+    truth: GroundTruth,
+    hidden: Bool[np.ndarray, "f h w"],
+    motions: Mapping[int, np.ndarray],
+) -> _Cloud:
+    """Return the points that some frames show, moved back to the first frame."""
+    rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
+    points, colors, numbers = [], [], []
+    chosen = np.unique(np.linspace(0, len(hidden) - 1, NEIGHBORS).astype(int))
+    for frame in chosen.tolist():
+        seen = ~hidden[frame] & np.isfinite(truth.depth_m[frame])
+        local = rays[seen] * truth.depth_m[frame][seen][:, None]
+        place = transform(cameras.world_from_camera[frame], local)
+        ids = truth.object_ids[frame][seen]
+        for number, motion in motions.items():
+            own = ids == number
+            place[own] = transform(np.linalg.inv(motion[frame]), place[own])
+        points.append(place)
+        colors.append(truth.frames[frame][seen])
+        numbers.append(ids)
+    return _Cloud(
+        points_m=np.concatenate(points),
+        colors=np.concatenate(colors),
+        object_ids=np.concatenate(numbers),
+    )
+
+
+def _one(cameras: Cameras, frame: int) -> Cameras:
+    return Cameras(
+        world_from_camera=cameras.world_from_camera[frame : frame + 1],
+        intrinsics_px=cameras.intrinsics_px,
+        height=cameras.height,
+        width=cameras.width,
+    )
+
+
+def moved(state: SceneState, motions: Mapping[int, np.ndarray]) -> SceneState:
+    """Return the state after a clip, with its objects where the clip left them."""
+    from dataclasses import replace
+
+    points = state.points_m.copy()
+    for number, motion in motions.items():
+        own = state.object_ids == number
+        points[own] = transform(motion[-1], points[own])
+    return replace(state, points_m=points, step=state.step + 1)
