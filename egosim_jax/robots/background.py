@@ -7,7 +7,7 @@ that frame; what other frames of the clip show; or an inpainted color, which is 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import no_type_check
 
 import numpy as np
@@ -23,6 +23,12 @@ NEIGHBORS = 8
 """Number of frames of a clip that others may take colors from."""
 INPAINT_PX = 3
 """Radius of the inpainting (Telea)."""
+SHADED = 0.88
+"""Share of its brightness in the state below which the scene near a hand is in its shadow."""
+SHADOW_REACH = 0.15
+"""Distance of a hand's shadow from the hand, in image widths."""
+SAME_M = 0.01
+"""Distance up to which a frame and the state show the same surface."""
 
 
 @no_type_check
@@ -36,6 +42,8 @@ class Background:
     """Depth in meters; infinite where it is unknown."""
     hidden: Bool[np.ndarray, "f h w"]
     """Mask of the pixels that showed a hand or its edge."""
+    shadow: int
+    """Number of pixels in the shadow of a hand, which have the state's color."""
     from_state: int
     """Number of hidden pixels that the state shows."""
     from_frames: int
@@ -70,7 +78,7 @@ class _Cloud:
 def remove_hands(state: SceneState, cameras: Cameras, truth: GroundTruth) -> Background:
     """Return the frames of a clip without hands, from the state before it and its ground truth.
 
-    The ground truth must have depth and ids. Raises `InputError` if it is for other cameras.
+    The ground truth must have depth and ids.
     """
     import cv2
 
@@ -79,39 +87,47 @@ def remove_hands(state: SceneState, cameras: Cameras, truth: GroundTruth) -> Bac
     square = np.ones((2 * MARGIN_PX + 1,) * 2, np.uint8)
     hands = (truth.object_ids < 0).astype(np.uint8)
     hidden = np.stack([cv2.dilate(mask, square) for mask in hands]) > 0
-    scene = _Cloud(
-        points_m=state.points_m, colors=state.colors, object_ids=state.object_ids
-    )
+    scene = _Cloud(points_m=state.points_m, colors=state.colors, object_ids=state.object_ids)
     around = _neighbors(cameras, truth, hidden, motions)
     frames, depth = truth.frames.copy(), truth.depth_m.copy()
-    counts = np.zeros(3, int)
+    counts = dict.fromkeys(("shadow", "from_state", "from_frames", "unknown"), 0)
     for frame, hole in enumerate(hidden):
         if not hole.any():
             continue
         missing = hole.copy()
-        for source, cloud in enumerate((scene, around)):
-            colors, seen_m = cloud.view(cameras, motions, frame)
+        colors, seen_m = scene.view(cameras, motions, frame)
+        fixed = (truth.object_ids[frame] == 0) & (abs(seen_m - depth[frame]) < SAME_M)
+        shaded = fixed & ~hole & _in_shadow(frames[frame], colors, hole)
+        frames[frame][shaded] = colors[shaded]
+        counts["shadow"] += int(shaded.sum())
+        for source in ("from_state", "from_frames"):
+            if source == "from_frames":
+                if not missing.any():
+                    break
+                colors, seen_m = around.view(cameras, motions, frame)
             taken = missing & np.isfinite(seen_m)
             frames[frame][taken], depth[frame][taken] = colors[taken], seen_m[taken]
-            counts[source] += taken.sum()
+            counts[source] += int(taken.sum())
             missing &= ~taken
-            if not missing.any():
-                break
-        counts[2] += missing.sum()
+        counts["unknown"] += int(missing.sum())
         depth[frame][missing] = np.inf
-        filled = cv2.inpaint(
+        frames[frame] = cv2.inpaint(
             frames[frame], missing.astype(np.uint8), INPAINT_PX, cv2.INPAINT_TELEA
         )
-        frames[frame][missing] = filled[missing]
-    from_state, from_frames, unknown = counts.tolist()
-    return Background(
-        frames=frames,
-        depth_m=depth,
-        hidden=hidden,
-        from_state=from_state,
-        from_frames=from_frames,
-        unknown=unknown,
-    )
+    return Background(frames=frames, depth_m=depth, hidden=hidden, **counts)
+
+
+def _in_shadow(
+    image: UInt8[np.ndarray, "h w 3"],
+    colors: UInt8[np.ndarray, "h w 3"],
+    hole: Bool[np.ndarray, "h w"],
+) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels near a hand that are darker than in the state."""
+    import cv2
+
+    far = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 3)
+    darker = image.astype(float).sum(axis=-1) < SHADED * colors.astype(float).sum(axis=-1)
+    return darker & (far < SHADOW_REACH * image.shape[1])
 
 
 def _neighbors(
@@ -143,18 +159,11 @@ def _neighbors(
 
 
 def _one(cameras: Cameras, frame: int) -> Cameras:
-    return Cameras(
-        world_from_camera=cameras.world_from_camera[frame : frame + 1],
-        intrinsics_px=cameras.intrinsics_px,
-        height=cameras.height,
-        width=cameras.width,
-    )
+    return replace(cameras, world_from_camera=cameras.world_from_camera[frame : frame + 1])
 
 
 def moved(state: SceneState, motions: Mapping[int, np.ndarray]) -> SceneState:
     """Return the state after a clip, with its objects where the clip left them."""
-    from dataclasses import replace
-
     points = state.points_m.copy()
     for number, motion in motions.items():
         own = state.object_ids == number

@@ -186,14 +186,12 @@ def video_of(conversion: Conversion) -> UInt8[np.ndarray, "f h w 3"]:
 
 def report_of(conversion: Conversion) -> dict[str, Any]:
     """Return what is reached and what not, and what is known behind the hands, as JSON."""
-    hidden = sum(int(b.hidden.sum()) for b in conversion.backgrounds)
+    counts = ("from_state", "from_frames", "unknown", "shadow")
     return {
         "robots": [_report(f, conversion.episode.fps) for f in conversion.followers],
-        "hidden_pixels": {
-            "all": hidden,
-            "from_state": sum(b.from_state for b in conversion.backgrounds),
-            "from_frames": sum(b.from_frames for b in conversion.backgrounds),
-            "unknown": sum(b.unknown for b in conversion.backgrounds),
+        "hand_pixels": {
+            "all": sum(int(b.hidden.sum()) for b in conversion.backgrounds),
+            **{name: sum(getattr(b, name) for b in conversion.backgrounds) for name in counts},
         },
     }
 
@@ -210,7 +208,7 @@ def _report(follower: Follower, fps: int) -> dict[str, Any]:
     return {
         "robot": arm.name,
         "hand": follower.hand,
-        "world_from_base": base,
+        "world_from_base": base.round(6).tolist(),
         "frames": len(joints),
         "frames_without_hand": int((~grips.seen).sum()),
         "reached": float(track.reached[grips.seen].mean()),

@@ -25,8 +25,8 @@ RAYS = 2
 """Color samples along each side of a pixel."""
 SHADOW = AMBIENT / (AMBIENT + SUNLIGHT)
 """Brightness of a surface in the shadow of a robot, as a share of its own."""
-SHADOW_PX = 0.006
-"""Softness of the shadow, in image widths."""
+SHADOW_M, SHADOW_PX = 0.25, 0.006
+"""Distance at which a shadow has faded, and its softness in image widths."""
 DRAWN_GROUPS = (0, 1, 2)
 """MuJoCo's groups of geometries that are drawn; the others are for collisions."""
 NEARER_M = 5e-4
@@ -189,7 +189,8 @@ def _shade(
     directions = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
     points = transform(pose, directions[known] * scene_m[known][:, None]).astype(np.float32)
     dark = np.zeros(scene_m.shape, np.float32)
-    dark[known] = rays.blocked(points + np.float32(2e-3) * sun, _all(sun, len(points)))
+    hits = rays.cast(points + np.float32(2e-3) * sun, _all(sun, len(points)))
+    dark[known] = np.clip(1 - hits.distances / SHADOW_M, 0, 1)
     dark = cv2.GaussianBlur(dark, (0, 0), max(SHADOW_PX * cameras.width, 0.5))
     return np.round(image * (1 - (1 - SHADOW) * dark[..., None])).astype(np.uint8)
 
