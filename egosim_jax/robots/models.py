@@ -141,9 +141,9 @@ def _sweep(
 
     data = mujoco.MjData(mj)
     driver = mj.joint(prefix + gripper.driver)
-    free = [j.dofadr[0] for j in joints if j.id != driver.id]
-    at = [j.qposadr[0] for j in joints]
-    follow = [j.qposadr[0] for j in joints if j.id != driver.id]
+    at = np.array([j.qposadr[0] for j in joints])
+    others = [j for j in joints if j.id != driver.id]
+    free, follow = (np.array([getattr(j, n)[0] for j in others]) for n in ("dofadr", "qposadr"))
     gaps, positions, grips = [], [], []
     for value in np.linspace(gripper.open, gripper.closed, OPENINGS):
         data.qpos[driver.qposadr[0]] = value
@@ -160,14 +160,14 @@ def _sweep(
 
 
 def _close_loops(
-    mj: mujoco.MjModel, data: mujoco.MjData, free: list[int], follow: list[int]
+    mj: mujoco.MjModel, data: mujoco.MjData, free: np.ndarray, follow: np.ndarray
 ) -> None:
     """Move the joints that follow the driver until the model's equalities hold (Gauss-Newton)."""
     import mujoco
 
     for _ in range(30):
         mujoco.mj_fwdPosition(mj, data)
-        if not (data.ne and free) or np.abs(data.efc_pos[: data.ne]).max() < 1e-7:
+        if not (data.ne and len(free)) or np.abs(data.efc_pos[: data.ne]).max() < 1e-7:
             return
         rows = data.efc_J.reshape(data.nefc, mj.nv)[: data.ne, free]
         step = np.linalg.lstsq(rows, data.efc_pos[: data.ne], rcond=1e-6)[0]

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import no_type_check
+from typing import TYPE_CHECKING, no_type_check
 
 import numpy as np
 from jaxtyping import Float
 
-from egosim_jax.geometry import invert
+from egosim_jax.geometry import invert, transform
 from egosim_jax.robots.ik import REACHED_M, Solver, Track
 from egosim_jax.robots.models import RobotModel, grip_of
 from egosim_jax.robots.retarget import Grips
+
+if TYPE_CHECKING:
+    import mujoco
 
 ANGLES = np.radians([0, 30, -30, 60, -60, 90, -90, 135, -135, 180])
 """Directions of the base as seen from the path, from the wearer's, in order of preference."""
@@ -27,6 +30,10 @@ GOOD_TURN = np.radians(15)
 """Direction error up to which a base is taken at once."""
 EYE_M = 0.12
 """Least distance of the arm's links from the camera."""
+WRIST_M = 0.1
+"""Distance from the gripper's wrist within which a link does not hide it."""
+BAD = 10.0
+"""Cost of a moment that is not reached or not seen, in radians of direction error."""
 MAX_TRACKS = 4
 """Number of bases whose whole path is tried."""
 FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -59,7 +66,7 @@ def place(
     By default, `base` is searched.
     """
     up_from_grip = invert(world_from_up) @ grips.world_from_grip
-    eyes = (eyes_m - world_from_up[:3, 3]) @ world_from_up[:3, :3]
+    eyes = transform(invert(world_from_up), eyes_m)
     moments = np.unique(np.linspace(0, len(eyes) - 1, MOMENTS).astype(int))
     facing = _facing(robot)
     bases = [_base(base[:3], np.radians(base[3]))] if base else _candidates(
@@ -70,7 +77,7 @@ def place(
         solver = Solver(robot, table_m=-up_from_base[2, 3])
         for flip in (np.eye(4), FLIP):
             path = invert(up_from_base) @ up_from_grip @ flip
-            local = transform_all(invert(up_from_base), eyes)
+            local = transform(invert(up_from_base), eyes)
             cost, start = _try(solver, path[moments], grips.opening_m[moments], local[moments])
             tried.append((cost, len(tried), up_from_base, path, start))
         if min(t[0] for t in tried[-2:]) < GOOD_TURN:
@@ -89,18 +96,13 @@ def place(
     return best
 
 
-def transform_all(a_from_b: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return points in another frame."""
-    return points @ a_from_b[:3, :3].T + a_from_b[:3, 3]
-
-
 def _try(
     solver: Solver, path: np.ndarray, openings: np.ndarray, eyes: np.ndarray
 ) -> tuple[float, np.ndarray]:
     """Return the cost of a base, and the posture at the first moment.
 
-    The cost is the mean direction error in radians, and 10 for each moment that is not reached or
-    in which the arm is at the camera or hides the pinch point from it.
+    The cost is the mean direction error in radians, and `BAD` for each moment that is not reached,
+    and for each in which the arm is at the camera or hides the gripper from it.
     """
     import mujoco
 
@@ -115,24 +117,23 @@ def _try(
         data.qpos[:] = robot.open(q, opening)
         mujoco.mj_kinematics(mj, data)
         grip = grip_of(robot, data)
-        miss = np.linalg.norm(grip[:3, 3] - pose[:3, 3])
+        miss = REACHED_M < np.linalg.norm(grip[:3, 3] - pose[:3, 3])
         turn = np.arccos(np.clip((np.sum(grip[:3, :3] * pose[:3, :3]) - 1) / 2, -1, 1))
-        near = np.linalg.norm(data.xpos[1:] - eye, axis=1).min() < EYE_M
-        cost += turn + 10 * (miss > REACHED_M) + 10 * (near or _hides(solver, data, eye, pose))
+        near = EYE_M > np.linalg.norm(data.xpos[1:] - eye, axis=1).min()
+        cost += float(turn) + BAD * (bool(miss) + (bool(near) or _hides(solver, data, eye)))
     return cost / len(path), start
 
 
-def _hides(solver: Solver, data: object, eye: np.ndarray, pose: np.ndarray) -> bool:
-    """Return whether a link but the gripper is between the camera and the wrist of the gripper."""
+def _hides(solver: Solver, data: mujoco.MjData, eye: np.ndarray) -> bool:
+    """Return whether a link is between the camera and the gripper's wrist."""
     import mujoco
 
-    mj, site = solver.robot.mj, solver.robot.site
-    wrist = data.xpos[mj.site_bodyid[site]]
-    ray = wrist - eye
-    length = np.linalg.norm(ray)
+    mj = solver.robot.mj
+    ray = data.xpos[mj.site_bodyid[solver.robot.site]] - eye
+    length = float(np.linalg.norm(ray))
     hit = np.zeros(1, np.int32)
-    found = mujoco.mj_ray(mj, data, eye, ray / length, None, True, -1, hit)
-    return 0 <= found < length - 0.1
+    distance = mujoco.mj_ray(mj, data, eye, ray / length, None, True, -1, hit)
+    return 0 <= float(distance) < length - WRIST_M
 
 
 def _candidates(
