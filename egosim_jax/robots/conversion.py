@@ -221,6 +221,7 @@ def _report(follower: Follower, fps: int) -> dict[str, Any]:
         "least_distance_from_limits": float(min((joints - low).min(), (high - joints).min())),
         "speed_in_limits": float(speed.max()) if speed.size else 0.0,
         "least_distance_from_table_m": float(track.clearance_m.min()),
+        "least_distance_of_links_m": float(track.apart_m.min()),
     }
 
 

@@ -29,6 +29,10 @@ CLEARANCE_M, WATCHED_M = 0.001, 0.04
 """Least distance from the table and between links; distance from which a pair is watched."""
 
 
+GAIN, LIFT_M = 0.5, 0.001
+"""Share of a gap that a step may close; lift of what is below the table, per step."""
+
+
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Track:
@@ -46,6 +50,8 @@ class Track:
     """Angle between the grip and the path's, in radians."""
     clearance_m: Float[np.ndarray, " f"]
     """Least distance of a moving link from the table; negative below it."""
+    apart_m: Float[np.ndarray, " f"]
+    """Least distance of the gripper from the arm's other links, at most `WATCHED_M`."""
 
     @property
     def reached(self) -> Bool[np.ndarray, " f"]:
@@ -71,15 +77,17 @@ class Solver:
         self.tasks = [self.frame, posture]
         self.frozen = [mink.DofFreezingTask(robot.mj, robot.gripper_dofs.tolist())]
         speeds = dict(zip(robot.arm.joints, robot.arm.speeds, strict=True))
+        self.apart = mink.CollisionAvoidanceLimit(
+            robot.mj,
+            _apart(robot, self.links),
+            minimum_distance_from_collisions=CLEARANCE_M,
+            collision_detection_distance=WATCHED_M,
+        )
         self.limits = [
             mink.ConfigurationLimit(robot.mj),
             mink.VelocityLimit(robot.mj, speeds),
-            mink.CollisionAvoidanceLimit(
-                robot.mj,
-                [(self.links, [TABLE]), *_apart(robot, self.links)],
-                minimum_distance_from_collisions=CLEARANCE_M,
-                collision_detection_distance=WATCHED_M,
-            ),
+            self.apart,
+            _table_limit(robot, self.links),
         ]
 
     def approach(
@@ -114,7 +122,7 @@ class Solver:
         """Return the track of some postures, compared with the path that they follow."""
         import mujoco
 
-        mj, grips, clearances = self.robot.mj, [], []
+        mj, grips, clearances, apart = self.robot.mj, [], [], []
         data, ends = mujoco.MjData(mj), np.zeros(6)
         table = mj.geom(TABLE).id
         for posture, opening in zip(q, openings, strict=True):
@@ -123,6 +131,11 @@ class Solver:
             grips.append(grip_of(self.robot, data))
             gaps = [mujoco.mj_geomDistance(mj, data, table, n, 1.0, ends) for n in self.links]
             clearances.append(min(gaps))
+            gaps = [
+                mujoco.mj_geomDistance(mj, data, a, b, WATCHED_M, ends)
+                for a, b in self.apart.geom_id_pairs
+            ]
+            apart.append(min(gaps, default=WATCHED_M))
         grips = np.array(grips)
         turn = np.einsum("fij,fij->f", grips[:, :3, :3], base_from_grip[:, :3, :3])
         return Track(
@@ -132,6 +145,7 @@ class Solver:
             error_m=np.linalg.norm(grips[:, :3, 3] - base_from_grip[:, :3, 3], axis=1),
             turn_error=np.arccos(np.clip((turn - 1) / 2, -1, 1)),
             clearance_m=np.array(clearances),
+            apart_m=np.array(apart),
         )
 
     def _limit_opening(self, opening_m: np.ndarray, fps: int) -> Float[np.ndarray, " f"]:
@@ -148,6 +162,7 @@ class Solver:
         mink, configuration = self.mink, self.configuration
         configuration.update(self.robot.open(q, opening_m))
         self.frame.set_target(mink.SE3.from_matrix(pose))
+        self.apart.gain = GAIN * step_s  # mink's gain is a share per second, not per step
         for _ in range(steps):
             try:
                 speed = mink.solve_ik(
@@ -160,6 +175,35 @@ class Solver:
             if np.abs(speed).max() * step_s < 1e-5:
                 break
         return configuration.q.copy()
+
+
+def _table_limit(robot: RobotModel, links: list[int]) -> Any:
+    """Return the limit of mink that keeps geometries above the table, and lifts those below it.
+
+    Mink's own limit for collisions only stops them, and a corner that turns down goes below.
+    """
+    import mink
+    import mujoco
+
+    mj, table = robot.mj, robot.mj.geom(TABLE).id
+    ends, jacobian = np.zeros(6), np.zeros((3, mj.nv))
+
+    class TableLimit(mink.Limit):
+        def compute_qp_inequalities(self, configuration: Any, dt: float) -> Any:
+            rows, bounds = [], []
+            for n in links:
+                gap = mujoco.mj_geomDistance(mj, configuration.data, table, n, WATCHED_M, ends)
+                if gap < WATCHED_M:
+                    mujoco.mj_jac(
+                        mj, configuration.data, jacobian, None, ends[3:], mj.geom_bodyid[n]
+                    )
+                    rows.append(-jacobian[2])
+                    bounds.append(max(GAIN * (gap - CLEARANCE_M), -LIFT_M))
+            if not rows:
+                return mink.Constraint()
+            return mink.Constraint(G=np.array(rows), h=np.array(bounds))
+
+    return TableLimit()
 
 
 def _links(mj: Any) -> list[int]:
