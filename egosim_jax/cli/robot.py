@@ -95,7 +95,6 @@ class Render:
         return ExitCode.DONE
 
 
-
 @dataclass(frozen=True, kw_only=True)
 class Robot:
     """Turn clips with hands into clips of robots, with their joint positions."""

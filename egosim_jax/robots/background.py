@@ -1,4 +1,4 @@
-"""Frames without hands: what is behind a hand, from the state or from other frames.
+"""Frames without hands: the scene behind them, from the state or from other frames.
 
 A hidden pixel takes, in this order, what the state shows there, with its objects where they are in
 that frame; what other frames of the clip show; or an inpainted color, which is counted as unknown.
@@ -37,7 +37,7 @@ class Background:
     """Frames of a clip without hands."""
 
     frames: UInt8[np.ndarray, "f h w 3"]
-    """Colors."""
+    """RGB of the scene."""
     depth_m: Float32[np.ndarray, "f h w"]
     """Depth in meters; infinite where it is unknown."""
     hidden: Bool[np.ndarray, "f h w"]
@@ -82,39 +82,41 @@ def remove_hands(state: SceneState, cameras: Cameras, truth: GroundTruth) -> Bac
     """
     import cv2
 
-    assert truth.depth_m is not None and truth.object_ids is not None
     motions = truth.motions or {}
     square = np.ones((2 * MARGIN_PX + 1,) * 2, np.uint8)
-    hands = (truth.object_ids < 0).astype(np.uint8)
-    hidden = np.stack([cv2.dilate(mask, square) for mask in hands]) > 0
+    hidden = np.stack([cv2.dilate((m < 0).astype(np.uint8), square) for m in truth.object_ids]) > 0
     scene = _Cloud(points_m=state.points_m, colors=state.colors, object_ids=state.object_ids)
-    around = _neighbors(cameras, truth, hidden, motions)
-    frames, depth = truth.frames.copy(), truth.depth_m.copy()
-    counts = dict.fromkeys(("shadow", "from_state", "from_frames", "unknown"), 0)
-    for frame, hole in enumerate(hidden):
-        if not hole.any():
-            continue
-        missing = hole.copy()
-        colors, seen_m = scene.view(cameras, motions, frame)
-        fixed = (truth.object_ids[frame] == 0) & (abs(seen_m - depth[frame]) < SAME_M)
-        shaded = fixed & ~hole & _in_shadow(frames[frame], colors, hole)
-        frames[frame][shaded] = colors[shaded]
-        counts["shadow"] += int(shaded.sum())
-        for source in ("from_state", "from_frames"):
-            if source == "from_frames":
-                if not missing.any():
-                    break
-                colors, seen_m = around.view(cameras, motions, frame)
-            taken = missing & np.isfinite(seen_m)
-            frames[frame][taken], depth[frame][taken] = colors[taken], seen_m[taken]
-            counts[source] += int(taken.sum())
-            missing &= ~taken
-        counts["unknown"] += int(missing.sum())
-        depth[frame][missing] = np.inf
-        frames[frame] = cv2.inpaint(
-            frames[frame], missing.astype(np.uint8), INPAINT_PX, cv2.INPAINT_TELEA
-        )
-    return Background(frames=frames, depth_m=depth, hidden=hidden, **counts)
+    frames, depth, missing = truth.frames.copy(), truth.depth_m.copy(), hidden.copy()
+    shadow = 0
+    (with_hands,) = np.nonzero(hidden.any(axis=(1, 2)))
+    for n in with_hands.tolist():
+        colors, seen_m = scene.view(cameras, motions, n)
+        fixed = (truth.object_ids[n] == 0) & (abs(seen_m - depth[n]) < SAME_M) & ~hidden[n]
+        shaded = fixed & _in_shadow(frames[n], colors, hidden[n])
+        shadow += int(shaded.sum())
+        taken = shaded | (hidden[n] & np.isfinite(seen_m))
+        frames[n][taken], depth[n][taken] = colors[taken], seen_m[taken]
+        missing[n] &= ~taken
+    from_state = int(hidden.sum() - missing.sum())
+    around = _neighbors(cameras, replace(truth, frames=frames), hidden, motions)
+    for n in np.flatnonzero(missing.any(axis=(1, 2))).tolist():
+        colors, seen_m = around.view(cameras, motions, n)
+        taken = missing[n] & np.isfinite(seen_m)
+        frames[n][taken], depth[n][taken] = colors[taken], seen_m[taken]
+        missing[n] &= ~taken
+        depth[n][missing[n]] = np.inf
+        hole = missing[n].astype(np.uint8)
+        frames[n] = cv2.inpaint(frames[n], hole, INPAINT_PX, cv2.INPAINT_TELEA)
+    unknown = int(missing.sum())
+    return Background(
+        frames=frames,
+        depth_m=depth,
+        hidden=hidden,
+        shadow=shadow,
+        from_state=from_state,
+        from_frames=int(hidden.sum()) - from_state - unknown,
+        unknown=unknown,
+    )
 
 
 def _in_shadow(

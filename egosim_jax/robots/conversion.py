@@ -77,7 +77,7 @@ def convert(
     truths = episode.ground_truth
     if not truths or any(t.depth_m is None or t.object_ids is None for t in truths):
         raise InputError(
-            "The episode has no depth and ids of its frames, which tell what is in front of the "
+            "The episode has no depth and ids of its frames, which say what hides the "
             "robot: make one with ground truth, such as egosim episode make --seed 0. (SOURCE)"
         )
     joints = _path([action.joints_m for action in episode.actions])
@@ -100,7 +100,7 @@ def convert(
 
 
 def _path(clips: list[np.ndarray]) -> np.ndarray:
-    """Join clips, each of which begins with the last frame of the one before."""
+    """Join clips; each begins with the last frame of the clip before."""
     return np.concatenate([clips[0], *(clip[1:] for clip in clips[1:])])
 
 
@@ -116,9 +116,7 @@ def _hands(joints: Float[np.ndarray, "f n j 3"], hands: Hands) -> list[int]:
     return [max(present, key=lambda hand: float(np.nansum(steps[:, hand])))]
 
 
-def up_frame(
-    state: SceneState, joints_m: Float[np.ndarray, "f n j 3"]
-) -> Float[np.ndarray, "4 4"]:
+def up_frame(state: SceneState, joints_m: Float[np.ndarray, "f n j 3"]) -> Float[np.ndarray, "4 4"]:
     """Return a frame on the table below the hands, z upwards."""
     up = np.array(UP_AXES[up_of(state)])
     ahead = np.array([0.0, 1.0, 0.0] if up[2] else [0.0, 0.0, 1.0])
@@ -185,7 +183,7 @@ def video_of(conversion: Conversion) -> UInt8[np.ndarray, "f h w 3"]:
 
 
 def report_of(conversion: Conversion) -> dict[str, Any]:
-    """Return what is reached and what not, and what is known behind the hands, as JSON."""
+    """Return the reached frames and the sources of the pixels behind hands, as JSON."""
     counts = ("from_state", "from_frames", "unknown", "shadow")
     return {
         "robots": [_report(f, conversion.episode.fps) for f in conversion.followers],
@@ -293,4 +291,3 @@ def _in_view(cameras: Cameras, joints: np.ndarray) -> np.ndarray:
     """Return the joints without hands that no camera of the clip sees."""
     seen = np.asarray(near_view(cameras, joints).any(axis=0))[:, None, None]
     return np.where(seen, joints, np.nan)
-

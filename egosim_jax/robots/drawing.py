@@ -24,13 +24,13 @@ from egosim_jax.worlds.tabletop.raycast import AMBIENT, SUN, SUNLIGHT
 RAYS = 2
 """Color samples along each side of a pixel."""
 SHADOW = AMBIENT / (AMBIENT + SUNLIGHT)
-"""Brightness of a surface in the shadow of a robot, as a share of its own."""
+"""Brightness of a surface in the shadow of a robot, relative to its brightness in the light."""
 SHADOW_M, SHADOW_PX = 0.25, 0.006
 """Distance at which a shadow has faded, and its softness in image widths."""
 DRAWN_GROUPS = (0, 1, 2)
 """MuJoCo's groups of geometries that are drawn; the others are for collisions."""
 NEARER_M = 5e-4
-"""Distance by which a robot must be nearer than the scene to hide it."""
+"""Minimum distance between a robot and the scene that it hides."""
 SIDES = 24
 """Sides of a drawn cylinder."""
 
@@ -41,7 +41,7 @@ class Drawn:
     """Frames with a robot."""
 
     frames: UInt8[np.ndarray, "f h w 3"]
-    """Colors."""
+    """RGB of robots and scene."""
     depth_m: Float32[np.ndarray, "f h w"]
     """Depth of the robot or the scene."""
     mask: Bool[np.ndarray, "f h w"]
@@ -195,18 +195,14 @@ def _shade(
     return np.round(image * (1 - (1 - SHADOW) * dark[..., None])).astype(np.uint8)
 
 
-def _window(
-    meshes: Sequence[Mesh], cameras: Cameras, pose: np.ndarray
-) -> tuple[slice, slice]:
+def _window(meshes: Sequence[Mesh], cameras: Cameras, pose: np.ndarray) -> tuple[slice, slice]:
     """Return the rows and columns that can show the meshes."""
     local = transform(invert(pose), np.concatenate([_corners(v) for v, _ in meshes]))
     if local[:, 2].min() < 0.02:  # corners behind the camera cannot be projected
         return slice(0, cameras.height), slice(0, cameras.width)
     u, v = project(cameras.intrinsics_px, local)
     ends = ((v, cameras.height), (u, cameras.width))
-    found = [
-        slice(max(0, int(x.min()) - 1), min(size, int(x.max()) + 2)) for x, size in ends
-    ]
+    found = [slice(max(0, int(x.min()) - 1), min(size, int(x.max()) + 2)) for x, size in ends]
     return found[0], found[1]
 
 

@@ -30,7 +30,7 @@ CLEARANCE_M, WATCHED_M = 0.001, 0.04
 
 
 GAIN, LIFT_M = 0.5, 0.001
-"""Share of a gap that a step may close; lift of what is below the table, per step."""
+"""Share of a gap that a step may close; lift of a link below the table, per step."""
 
 
 @no_type_check
@@ -116,9 +116,7 @@ class Solver:
             found.append(q)
         return self.measure(np.array(found), openings, base_from_grip)
 
-    def measure(
-        self, q: np.ndarray, openings: np.ndarray, base_from_grip: np.ndarray
-    ) -> Track:
+    def measure(self, q: np.ndarray, openings: np.ndarray, base_from_grip: np.ndarray) -> Track:
         """Return the track of some postures, compared with the path that they follow."""
         import mujoco
 
@@ -170,7 +168,7 @@ class Solver:
                     limits=self.limits, constraints=self.frozen,
                 )  # fmt: skip
             except mink.NoSolutionFound:
-                break  # the links cannot leave a collision within their limits: stand still
+                break  # the links cannot leave a collision within their limits
             configuration.integrate_inplace(speed, step_s)
             if np.abs(speed).max() * step_s < 1e-5:
                 break

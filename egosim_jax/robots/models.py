@@ -1,6 +1,6 @@
 """MuJoCo models of arms: loading, and the positions of a gripper's joints by its opening.
 
-The arm stands at the origin of its base frame, z upwards. The table is a plane below it.
+The arm is at the origin of its base frame, z upwards. The table is a plane below it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import mujoco
 
 TABLE = "table of egosim"
-"""Name of the plane that stands for the table."""
+"""Name of the plane of the table."""
 GRIP = "grip of egosim"
 """Name of the site at the grip (`retarget.py`)."""
 MOUNTED = "mounted/"
@@ -117,7 +117,7 @@ def make_model(arm: Arm, spec: mujoco.MjSpec) -> RobotModel:
     gripper = [j for j in map(mj.joint, range(mj.njnt)) if j.name not in arm.joints]
     openings, positions, grips = _sweep(mj, arm.gripper, prefix, gripper)
     site = mj.site(GRIP).id
-    # The compiler marks what is at the origin of its body, and MuJoCo then ignores its own pose.
+    # The compiler marks frames at the origin of its body, and MuJoCo then ignores its own pose.
     mj.site_sameframe[site] = mj.geom_sameframe[mj.geom(TABLE).id] = 0
     mujoco.mju_mat2Quat(mj.site_quat[site], grips[-1, :3, :3].ravel())
     return RobotModel(

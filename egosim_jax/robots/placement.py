@@ -1,4 +1,4 @@
-"""Placement of a robot's base, so that it reaches a path of grips without standing in the view."""
+"""Placement of a robot's base, so that it reaches a path of grips without hiding the view."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ WRIST_M = 0.1
 """Distance from the gripper's wrist within which a link does not hide it."""
 BAD = 10.0
 """Cost of a moment that is not reached or not seen, in radians of direction error."""
-MAX_TRACKS = 4
-"""Number of bases whose whole path is tried."""
+MAX_TRACKS, ENOUGH = 4, 0.99
+"""Maximum number of bases whose whole path is tried, and share of it that ends the search."""
 FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Half turn of a grip about its approach: the two fingers change places."""
 
@@ -69,8 +69,10 @@ def place(
     eyes = transform(invert(world_from_up), eyes_m)
     moments = np.unique(np.linspace(0, len(eyes) - 1, MOMENTS).astype(int))
     facing = _facing(robot)
-    bases = [_base(base[:3], np.radians(base[3]))] if base else _candidates(
-        robot, up_from_grip[:, :3, 3], eyes, facing
+    bases = (
+        [_base(base[:3], np.radians(base[3]))]
+        if base
+        else _candidates(robot, up_from_grip[:, :3, 3], eyes, facing)
     )
     tried = []
     for up_from_base in bases:
@@ -83,17 +85,14 @@ def place(
         if min(t[0] for t in tried[-2:]) < GOOD_TURN:
             break
     tried.sort(key=lambda t: t[:2])
-    best: Placed | None = None
+    found: list[Placed] = []
     for _, _, up_from_base, path, start in tried[:MAX_TRACKS]:
         solver = Solver(robot, table_m=-up_from_base[2, 3])
         track = solver.follow(start, path, grips.opening_m, fps=fps)
-        found = Placed(world_from_base=world_from_up @ up_from_base, track=track)
-        if best is None or track.reached.sum() > best.track.reached.sum():
-            best = found
-        if best.track.reached[grips.seen].mean() >= 0.99:
+        found.append(Placed(world_from_base=world_from_up @ up_from_base, track=track))
+        if track.reached[grips.seen].mean() >= ENOUGH:
             break
-    assert best is not None
-    return best
+    return max(found, key=lambda placed: placed.track.reached[grips.seen].sum())
 
 
 def _try(
@@ -117,10 +116,10 @@ def _try(
         data.qpos[:] = robot.open(q, opening)
         mujoco.mj_kinematics(mj, data)
         grip = grip_of(robot, data)
-        miss = REACHED_M < np.linalg.norm(grip[:3, 3] - pose[:3, 3])
+        miss = bool(np.linalg.norm(grip[:3, 3] - pose[:3, 3]) > REACHED_M)
         turn = np.arccos(np.clip((np.sum(grip[:3, :3] * pose[:3, :3]) - 1) / 2, -1, 1))
-        near = EYE_M > np.linalg.norm(data.xpos[1:] - eye, axis=1).min()
-        cost += float(turn) + BAD * (bool(miss) + (bool(near) or _hides(solver, data, eye)))
+        near = bool(np.linalg.norm(data.xpos[1:] - eye, axis=1).min() < EYE_M)
+        cost += float(turn) + BAD * (miss + (near or _hides(solver, data, eye)))
     return cost / len(path), start
 
 

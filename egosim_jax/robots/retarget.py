@@ -1,4 +1,4 @@
-"""Grips: where a gripper must be to stand for a hand, and how far it must open.
+"""Grips: the pose of a gripper that replaces a hand, and how far it must open.
 
 A grip's frame has its origin at the pinch point, halfway between thumb and fingers. Its z axis is
 the approach, from the wrist to the pinch point; its x axis points from the thumb to the fingers,
@@ -27,7 +27,7 @@ class Grips:
     """Path of one hand as a gripper's."""
 
     world_from_grip: Float[np.ndarray, "f 4 4"]
-    """Pose of the grip; that of the nearest frame where the hand is missing."""
+    """Pose of the grip; the pose of the nearest frame where the hand is missing."""
     opening_m: Float[np.ndarray, " f"]
     """Distance between the fingertips in meters."""
     seen: Bool[np.ndarray, " f"]

@@ -26,9 +26,7 @@ def cameras():
     poses = np.tile(np.eye(4), (FRAMES, 1, 1))
     poses[:, :3, :3] = np.diag([1.0, -1.0, -1.0])
     poses[:, 2, 3] = 1
-    return Cameras(
-        world_from_camera=poses, intrinsics_px=intrinsics, height=HEIGHT, width=WIDTH
-    )
+    return Cameras(world_from_camera=poses, intrinsics_px=intrinsics, height=HEIGHT, width=WIDTH)
 
 
 def scene(cameras):
@@ -70,7 +68,7 @@ def test_the_shadow_of_a_hand_is_removed_and_that_of_others_stays(cameras):
     state, clean = scene(cameras)
     frames, ids, depth = clean.frames.copy(), clean.object_ids.copy(), clean.depth_m.copy()
     ids[:, 18:22, 24:28], depth[:, 18:22, 24:28] = -1, 0.7
-    frames[:, 18:22, 20:23] = 60  # beside the hand
+    frames[:, 18:22, 20:23] = 60  # next to the hand
     frames[:, 2:4, 2:6] = 60
     given = GroundTruth(frames=frames, depth_m=depth, object_ids=ids, motions=clean.motions)
     found = remove_hands(state, cameras, given)
@@ -90,7 +88,7 @@ def test_objects_are_where_the_clip_left_them(cameras):
 
 @pytest.mark.parametrize(("height_m", "seen"), [(0.3, True), (-0.3, False)])
 def test_a_robot_hides_only_what_is_behind_it(cameras, height_m, seen):
-    state, clean = scene(cameras)
+    _, clean = scene(cameras)
     vertices, triangles = sphere(0.1, 12)
     ball = (vertices + [0, 0, height_m], triangles)
     drawn = draw(
