@@ -166,7 +166,7 @@ ARMS = {arm.name: arm for arm in (PANDA, UR5E, XARM7, SO_ARM100, VX300S)}
 
 
 def arm_of(name: str) -> Arm:
-    """Return an arm by name; raise `InputError` if there is none."""
+    """Return an arm by name; raise `InputError` for an unknown name."""
     if name not in ARMS:
         raise InputError(
             f"There is no robot {name[:40]!r}: choose one of {', '.join(ARMS)}, listed by egosim "

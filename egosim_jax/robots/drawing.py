@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
 from typing import Any, no_type_check
 
 import numpy as np
@@ -69,7 +70,7 @@ class Shape:
 
     def pose(self, q: np.ndarray, opening_m: float, world_from_base: np.ndarray) -> list[Mesh]:
         """Return the meshes in the world for a posture."""
-        import mujoco
+        mujoco: Any = import_module("mujoco")
 
         mj = self.robot.mj
         data = mujoco.MjData(mj)
@@ -85,7 +86,7 @@ class Shape:
 
 def _mesh_of(mj: Any, geom: int) -> Mesh | None:
     """Return the mesh of a geometry in its frame; None for a kind that no arm has."""
-    import mujoco
+    mujoco: Any = import_module("mujoco")
 
     kind, size = mujoco.mjtGeom(int(mj.geom_type[geom])), mj.geom_size[geom]
     if kind == mujoco.mjtGeom.mjGEOM_MESH:

@@ -8,6 +8,7 @@ cannot follow is not followed; the track says by how much.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, no_type_check
 
 import numpy as np
@@ -118,7 +119,7 @@ class Solver:
 
     def measure(self, q: np.ndarray, openings: np.ndarray, base_from_grip: np.ndarray) -> Track:
         """Return the track of some postures, compared with the path that they follow."""
-        import mujoco
+        mujoco: Any = import_module("mujoco")
 
         mj, grips, clearances, apart = self.robot.mj, [], [], []
         data, ends = mujoco.MjData(mj), np.zeros(6)
@@ -181,7 +182,8 @@ def _table_limit(robot: RobotModel, links: list[int]) -> Any:
     Mink's own limit for collisions only stops them, and a corner that turns down goes below.
     """
     import mink
-    import mujoco
+
+    mujoco: Any = import_module("mujoco")
 
     mj, table = robot.mj, robot.mj.geom(TABLE).id
     ends, jacobian = np.zeros(6), np.zeros((3, mj.nv))
@@ -219,7 +221,7 @@ def _apart(robot: RobotModel, links: list[int]) -> list[tuple[list[int], list[in
     Collision meshes of neighbors overlap in every posture. The gripper can meet the base and the
     first links; others are farther apart.
     """
-    import mujoco
+    mujoco: Any = import_module("mujoco")
 
     mj = robot.mj
     data, ends = mujoco.MjData(mj), np.zeros(6)

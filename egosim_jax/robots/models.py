@@ -6,17 +6,15 @@ The arm is at the origin of its base frame, z upwards. The table is a plane belo
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, no_type_check
+from typing import Any, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from egosim_jax.robots.arms import Arm, Gripper
 from egosim_jax.types import InputError
-
-if TYPE_CHECKING:
-    import mujoco
 
 TABLE = "table of egosim"
 """Name of the plane of the table."""
@@ -88,7 +86,7 @@ def load_model(arm: Arm) -> RobotModel:
     return make_model(arm, spec)
 
 
-def _spec(model: tuple[str, str]) -> mujoco.MjSpec:
+def _spec(model: tuple[str, str]) -> Any:
     import mujoco_menagerie
 
     folder, name = model
@@ -101,9 +99,9 @@ def _spec(model: tuple[str, str]) -> mujoco.MjSpec:
         ) from error
 
 
-def make_model(arm: Arm, spec: mujoco.MjSpec) -> RobotModel:
+def make_model(arm: Arm, spec: Any) -> RobotModel:
     """Return the model of an arm from its specification, with a plane for the table."""
-    import mujoco
+    mujoco: Any = import_module("mujoco")
 
     prefix = MOUNTED if arm.gripper.model else ""
     for key in list(spec.keys):
@@ -134,10 +132,10 @@ def make_model(arm: Arm, spec: mujoco.MjSpec) -> RobotModel:
 
 
 def _sweep(
-    mj: mujoco.MjModel, gripper: Gripper, prefix: str, joints: list[Any]
+    mj: Any, gripper: Gripper, prefix: str, joints: list[Any]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return opening, joint positions and grip while the driver moves from closed to open."""
-    import mujoco
+    mujoco: Any = import_module("mujoco")
 
     data = mujoco.MjData(mj)
     driver = mj.joint(prefix + gripper.driver)
@@ -159,11 +157,9 @@ def _sweep(
     return gaps[order], np.array(positions)[order], np.array(grips)[order]
 
 
-def _close_loops(
-    mj: mujoco.MjModel, data: mujoco.MjData, free: np.ndarray, follow: np.ndarray
-) -> None:
+def _close_loops(mj: Any, data: Any, free: np.ndarray, follow: np.ndarray) -> None:
     """Move the joints that follow the driver until the model's equalities hold (Gauss-Newton)."""
-    import mujoco
+    mujoco: Any = import_module("mujoco")
 
     for _ in range(30):
         mujoco.mj_fwdPosition(mj, data)
@@ -199,7 +195,7 @@ def _between(openings: np.ndarray, values: np.ndarray, opening_m: float) -> np.n
     return np.array([np.interp(opening_m, openings, column) for column in values.T])
 
 
-def grip_of(robot: RobotModel, data: mujoco.MjData) -> Float[np.ndarray, "4 4"]:
+def grip_of(robot: RobotModel, data: Any) -> Float[np.ndarray, "4 4"]:
     """Return the pose of the grip in the base frame."""
     pose = np.eye(4)
     pose[:3, :3] = data.site_xmat[robot.site].reshape(3, 3)

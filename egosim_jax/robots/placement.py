@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, no_type_check
+from importlib import import_module
+from typing import Any, no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -12,9 +13,6 @@ from egosim_jax.geometry import invert, transform
 from egosim_jax.robots.ik import REACHED_M, Solver, Track
 from egosim_jax.robots.models import RobotModel, grip_of
 from egosim_jax.robots.retarget import Grips
-
-if TYPE_CHECKING:
-    import mujoco
 
 ANGLES = np.radians([0, 30, -30, 60, -60, 90, -90, 135, -135, 180])
 """Directions of the base as seen from the path, from the wearer's, in order of preference."""
@@ -103,7 +101,7 @@ def _try(
     The cost is the mean direction error in radians, and `BAD` for each moment that is not reached,
     and for each in which the arm is at the camera or hides the gripper from it.
     """
-    import mujoco
+    mujoco: Any = import_module("mujoco")
 
     robot, mj = solver.robot, solver.robot.mj
     data = mujoco.MjData(mj)
@@ -123,9 +121,9 @@ def _try(
     return cost / len(path), start
 
 
-def _hides(solver: Solver, data: mujoco.MjData, eye: np.ndarray) -> bool:
+def _hides(solver: Solver, data: Any, eye: np.ndarray) -> bool:
     """Return whether a link is between the camera and the gripper's wrist."""
-    import mujoco
+    mujoco: Any = import_module("mujoco")
 
     mj = solver.robot.mj
     ray = data.xpos[mj.site_bodyid[solver.robot.site]] - eye
@@ -154,7 +152,7 @@ def _candidates(
 
 def _facing(robot: RobotModel) -> float:
     """Return the direction of the gripper at home, as an angle about z."""
-    import mujoco
+    mujoco: Any = import_module("mujoco")
 
     data = mujoco.MjData(robot.mj)
     data.qpos[:] = robot.home

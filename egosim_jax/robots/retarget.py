@@ -48,7 +48,7 @@ def tips_of(joints_m: Float[np.ndarray, "*f j 3"]) -> tuple[np.ndarray, np.ndarr
 
 def grips_of(joints_m: Float[np.ndarray, "f j 3"], *, fps: int) -> Grips:
     """Return the grips of one hand; a missing hand has joints of NaN, but not in all frames."""
-    seen = np.isfinite(joints_m).all(axis=(1, 2))
+    seen = np.asarray(np.isfinite(joints_m).all(axis=(1, 2)))
     (known,) = np.nonzero(seen)
     thumb, fingers = tips_of(joints_m[known])
     pinch = (thumb + fingers) / 2
