@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from egosim_jax.geometry import pixel_rays, transform
 from egosim_jax.rendering.reference import add_margin, close_gaps, splat
-from egosim_jax.types import Cameras, GroundTruth, SceneState
+from egosim_jax.types import Cameras, GroundTruth, InputError, SceneState
 
 MARGIN_PX = 1
 """Pixels around a hand that are mixed with its color."""
@@ -78,27 +78,32 @@ class _Cloud:
 def remove_hands(state: SceneState, cameras: Cameras, truth: GroundTruth) -> Background:
     """Return the frames of a clip without hands, from the state before it and its ground truth.
 
-    The ground truth must have depth and ids.
+    Raises `InputError` if the ground truth has no depth or ids.
     """
     import cv2
 
-    motions = truth.motions or {}
+    ids, known_m, motions = truth.object_ids, truth.depth_m, truth.motions or {}
+    if ids is None or known_m is None:
+        raise InputError(
+            "The episode has no depth and ids of its frames, which say what hides the robot: make "
+            "one with ground truth, such as egosim episode make --seed 0. (SOURCE)"
+        )
     square = np.ones((2 * MARGIN_PX + 1,) * 2, np.uint8)
-    hidden = np.stack([cv2.dilate((m < 0).astype(np.uint8), square) for m in truth.object_ids]) > 0
+    hidden = np.stack([cv2.dilate((m < 0).astype(np.uint8), square) for m in ids]) > 0
     scene = _Cloud(points_m=state.points_m, colors=state.colors, object_ids=state.object_ids)
-    frames, depth, missing = truth.frames.copy(), truth.depth_m.copy(), hidden.copy()
+    frames, depth, missing = truth.frames.copy(), known_m.copy(), hidden.copy()
     shadow = 0
     (with_hands,) = np.nonzero(hidden.any(axis=(1, 2)))
     for n in with_hands.tolist():
         colors, seen_m = scene.view(cameras, motions, n)
-        fixed = (truth.object_ids[n] == 0) & (abs(seen_m - depth[n]) < SAME_M) & ~hidden[n]
+        fixed = (ids[n] == 0) & (abs(seen_m - depth[n]) < SAME_M) & ~hidden[n]
         shaded = fixed & _in_shadow(frames[n], colors, hidden[n])
         shadow += int(shaded.sum())
         taken = shaded | (hidden[n] & np.isfinite(seen_m))
         frames[n][taken], depth[n][taken] = colors[taken], seen_m[taken]
         missing[n] &= ~taken
     from_state = int(hidden.sum() - missing.sum())
-    around = _neighbors(cameras, replace(truth, frames=frames), hidden, motions)
+    around = _neighbors(cameras, frames, known_m, ids, hidden, motions)
     for n in np.flatnonzero(missing.any(axis=(1, 2))).tolist():
         colors, seen_m = around.view(cameras, motions, n)
         taken = missing[n] & np.isfinite(seen_m)
@@ -134,7 +139,9 @@ def _in_shadow(
 
 def _neighbors(
     cameras: Cameras,
-    truth: GroundTruth,
+    frames: UInt8[np.ndarray, "f h w 3"],
+    depth_m: Float32[np.ndarray, "f h w"],
+    object_ids: Int[np.ndarray, "f h w"],
     hidden: Bool[np.ndarray, "f h w"],
     motions: Mapping[int, np.ndarray],
 ) -> _Cloud:
@@ -143,15 +150,15 @@ def _neighbors(
     points, colors, numbers = [], [], []
     chosen = np.unique(np.linspace(0, len(hidden) - 1, NEIGHBORS).astype(int))
     for frame in chosen.tolist():
-        seen = ~hidden[frame] & np.isfinite(truth.depth_m[frame])
-        local = rays[seen] * truth.depth_m[frame][seen][:, None]
+        seen = ~hidden[frame] & np.isfinite(depth_m[frame])
+        local = rays[seen] * depth_m[frame][seen][:, None]
         place = transform(cameras.world_from_camera[frame], local)
-        ids = truth.object_ids[frame][seen]
+        ids = object_ids[frame][seen]
         for number, motion in motions.items():
             own = ids == number
             place[own] = transform(np.linalg.inv(motion[frame]), place[own])
         points.append(place)
-        colors.append(truth.frames[frame][seen])
+        colors.append(frames[frame][seen])
         numbers.append(ids)
     return _Cloud(
         points_m=np.concatenate(points),

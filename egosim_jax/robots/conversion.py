@@ -74,12 +74,12 @@ def convert(
 
     Raises `InputError` without hands, and without ground truth of depth and ids.
     """
-    truths = episode.ground_truth
-    if not truths or any(t.depth_m is None or t.object_ids is None for t in truths):
+    if not episode.ground_truth:
         raise InputError(
-            "The episode has no depth and ids of its frames, which say what hides the "
-            "robot: make one with ground truth, such as egosim episode make --seed 0. (SOURCE)"
+            "The episode has no ground truth, in whose frames the robot is drawn: make one with it, "
+            "such as egosim episode make --seed 0. (SOURCE)"
         )
+    backgrounds = _backgrounds(episode)
     joints = _path([action.joints_m for action in episode.actions])
     eyes = _path([a.cameras.world_from_camera[:, :3, 3] for a in episode.actions])
     chosen = _hands(joints, hands)
@@ -94,7 +94,7 @@ def convert(
         )
         followers.append(Follower(robot=robot, hand=hand, grips=grips, placed=placed))
     found = Conversion(
-        episode=episode, followers=tuple(followers), backgrounds=_backgrounds(episode), drawn=()
+        episode=episode, followers=tuple(followers), backgrounds=backgrounds, drawn=()
     )
     return replace(found, drawn=tuple(_drawn(found, world_from_up)))
 

@@ -76,7 +76,7 @@ def test_the_dataset_replays_the_path_of_the_grip(converted, tmp_path):
 
 def test_an_episode_without_ground_truth_is_refused(episode):
     bare = Episode(state=episode.state, actions=episode.actions, fps=episode.fps)
-    with pytest.raises(InputError, match="no depth and ids"):
+    with pytest.raises(InputError, match="no ground truth"):
         convert(bare, make_toy())
 
 
