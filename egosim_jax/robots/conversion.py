@@ -76,7 +76,7 @@ def convert(
     """
     if not episode.ground_truth:
         raise InputError(
-            "The episode has no ground truth, in whose frames the robot is drawn: make one with it, "
+            "The episode has no ground truth, in whose frames a robot is drawn: make one with it, "
             "such as egosim episode make --seed 0. (SOURCE)"
         )
     backgrounds = _backgrounds(episode)
