@@ -26,6 +26,19 @@ def up_of(state: SceneState) -> Up:
     return "z" if state.provenance.get("world") == "tabletop" else "-y"
 
 
+def upward(
+    state: SceneState, world_from_camera: Float[np.ndarray, "4 4"]
+) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"] | None]:
+    """Return the vertical of a state's world; or a camera's upward direction, and its position.
+
+    Only the tabletop world says where up is. Others may have any axes, so a camera says it: its
+    upward direction (-y) is up to 75 degrees from the vertical.
+    """
+    if up_of(state) == "z":
+        return np.array(UP_AXES["z"], float), None
+    return -world_from_camera[:3, 1], world_from_camera[:3, 3]
+
+
 def transform(a_from_b: Float[Any, "*#b 4 4"], points: Float[Any, "*#b n 3"]) -> Any:
     """Transform points `*b n 3` from frame b to frame a."""
     return points @ a_from_b[..., :3, :3].swapaxes(-1, -2) + a_from_b[..., None, :3, 3]

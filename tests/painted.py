@@ -9,7 +9,7 @@ import argparse
 import functools
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -45,8 +45,19 @@ class Painter:
         return "painter"
 
 
-class BatchPainter(Painter):
+class ChunkPainter(Painter):
+    """Painter of a clip in chunks of 3 and 2 frames; equal actions give the painter's clip."""
+
+    chunk_frames = (3, 2)
+
+    def begin(self, first_frame, seed):
+        return _PaintedChunks(self, np.random.default_rng(seed))
+
+
+class BatchPainter(ChunkPainter):
     """Painter of a batch of clips in the time of one clip."""
+
+    chunk_frames = (5,)
 
     def condition(self, view, action, first_frame):
         return view, action
@@ -59,6 +70,23 @@ class BatchPainter(Painter):
         yield frames[:, :1]
         time.sleep(self.pause)
         yield frames[:, 1:]
+
+
+@dataclass
+class _PaintedChunks:
+    """Chunks of a clip (`simulator.ClipStream`)."""
+
+    painter: ChunkPainter
+    rng: np.random.Generator
+    waiting: list = field(default_factory=list)
+
+    def put(self, view, action):
+        self.waiting.append(self.painter.paint(view, action, self.rng))
+
+    def take(self):
+        frames = self.waiting.pop(0)
+        yield frames[:1]
+        yield frames[1:]
 
 
 class PaintedWorld(GeneratedWorld):

@@ -29,8 +29,8 @@ from egosim_jax.io.digest import sha256
 from egosim_jax.io.run import plain, write_json
 from egosim_jax.train.bundle import FILES, LATENTS, RECIPE, SHARD_BYTES, WEIGHTS
 from egosim_jax.train.config import TrainConfig
+from egosim_jax.train.task import Stage
 from egosim_jax.train.tasks.denoising import Denoising
-from egosim_jax.train.update import Stage
 from egosim_jax.types import InputError
 
 WIDER: dict[str, Any] = {

@@ -144,6 +144,20 @@ class TrainConfig:
                 check_installed(extra)
 
 
+@dataclass(frozen=True, kw_only=True)
+class CriticConfig:
+    """Training of a distillation's critic, which follows what the student makes."""
+
+    updates: int = 5
+    """Updates of the critic before each update of the student."""
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    """Optimizer and learning-rate schedule of the critic."""
+
+    def __post_init__(self) -> None:
+        """Check the number of updates."""
+        check_counts({"critic.updates": self.updates})
+
+
 RESUME_MUTABLE = (
     "mesh", "grad_accum_steps", "log_every", "save_every", "validate_every", "sample_every", "keep",
     "keep_every", "fallback", "workers", "hang_timeout_s", "tensorboard", "wandb",

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.models.attention import Kernel
 from egosim_jax.models.chunks import Chunks
+from egosim_jax.models.layers import Products
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.train.config import TrainConfig
 from egosim_jax.train.recipe import Recipe
-from egosim_jax.train.update import Stage
+from egosim_jax.train.task import Stage
 from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:
@@ -33,13 +34,17 @@ class FineTuning(Recipe):
         "object stores": ("cache", "cache_gb"),
         "method": (
             "rank",
+            "lora",
             "chunks",
             "times",
+            "sampler_steps",
             "max_difference",
+            "change_loss_weight",
             "navigation",
             "remat",
             "attention",
             "dtype",
+            "products",
             "samples",
         ),
     }
@@ -59,16 +64,22 @@ class FineTuning(Recipe):
     """Maximum size of these copies in GB."""
     rank: int | None = None
     """Rank of a LoRA to train instead of the weights."""
+    lora: Path | None = None
+    """LoRA of this rank and of these weights to train further, a run's lora.safetensors."""
     chunks: tuple[int, ...] | None = None
     """Latent frames of each chunk of a causal student; None: the model's.
 
     The student learns from the clean chunks of the clip before each chunk (teacher forcing)."""
     times: Literal["uniform", "logit-normal", "diffsynth"] = "diffsynth"
     """Distribution and weighting of the noise levels."""
+    sampler_steps: int | None = None
+    """Half of the samples have a noise level that a sampler of so many steps visits; None: none."""
     max_difference: float | None = None
     """Ignore elements whose prediction is further than this from the target; None: ignore none."""
     dropout: ConditionDropout = field(default_factory=ConditionDropout)
     """Dropout rate of each condition."""
+    change_loss_weight: float = 0.0
+    """Additional loss weight where the clip differs from its prior: hands and moved objects."""
     navigation: float = 0.0
     """Rate of samples without hands whose target is the prior (DWM's regularizer)."""
     remat: str | None = None
@@ -77,6 +88,8 @@ class FineTuning(Recipe):
     """Attention kernel; None: the model's."""
     dtype: Literal["float32", "bfloat16"] | None = None
     """Compute dtype; None: the model's. Trained weights and moments are always float32."""
+    products: Products | None = None
+    """Dtype of the factors of products; None: the model's."""
     samples: int = 2
     """Number of validation clips to generate every `sample_every` updates."""
 
@@ -85,15 +98,25 @@ class FineTuning(Recipe):
         from egosim_jax.diffusion.objective import Objective
         from egosim_jax.train.tasks.denoising import Denoising
 
-        model = self.model()
-        task = Denoising(
-            model=model,
-            objective=Objective(times=self.times, max_difference=self.max_difference),
-            dropout=self.dropout,
-            rank=self.rank,
-            navigation=self.navigation,
+        objective = Objective(
+            times=self.times, max_difference=self.max_difference, sampler_steps=self.sampler_steps
         )
-        return {"training": Stage(task, self.training)}
+        return {"training": Stage(Denoising(objective=objective, **self.options()), self.training)}
+
+    def options(self) -> dict[str, Any]:
+        """Return the fields of every task that trains this recipe's model."""
+        return {
+            "model": self.model(),
+            "dropout": self.dropout,
+            "change_loss_weight": self.change_loss_weight,
+            "rank": self.rank,
+            "navigation": self.navigation,
+        }
+
+    @property
+    def teacher_folder(self) -> Path | None:
+        """Weights folder of the teacher of a distillation; None: the student at its start."""
+        return None
 
     def train(self) -> int:
         """Check the latents, train, and write the weights."""
@@ -105,6 +128,7 @@ class FineTuning(Recipe):
 
         model = self.model()
         check_folder(weights, model.name)
+        self.check_lora(weights)
         latents = self._local_shards(latents)
         validation = None if self.validation is None else self._local_shards(self.validation)
         for shards in (latents, validation):
@@ -116,11 +140,26 @@ class FineTuning(Recipe):
             validation=validation,
             out=out,
             weights=weights,
+            lora=self.lora,
+            teacher=self.teacher_folder,
             samples=validation
             and Samples(model=model, latents=validation, vae=weights, count=self.samples),
         )
         print(write_trained(trained, out, model=model, start=weights, rank=self.rank))
         return ExitCode.DONE
+
+    def check_lora(self, weights: Path) -> None:
+        """Raise `InputError` for a LoRA of other weights, or without `rank`."""
+        if self.lora is None:
+            return
+        from egosim_jax.convert.lora import check_base
+        from egosim_jax.io.weights import hashes
+
+        if self.rank is None:
+            raise InputError(
+                f"{self.lora} is trained further as a LoRA: give its rank. (--rank, --lora)"
+            )
+        check_base(self.lora, [hashes(weights, only=["dit"])["dit"]])
 
     def _local_shards(self, shards: str | Path) -> Path:
         """Return a folder of shards; after a copy from a store, when all processes have theirs."""
@@ -142,7 +181,12 @@ class FineTuning(Recipe):
 
         model = configs.get(self.config)
         model = model if self.weights is None else model.at(self.weights)
-        changes = {"remat": self.remat, "attention": self.attention, "dtype": self.dtype}
+        changes = {
+            "remat": self.remat,
+            "attention": self.attention,
+            "dtype": self.dtype,
+            "products": self.products,
+        }
         given = {name: value for name, value in changes.items() if value is not None}
         if unknown := sorted(given.keys() - set(model.dit.numerics_only)):
             options = ", ".join(f"--{name}" for name in unknown)
@@ -163,11 +207,14 @@ def write_trained(
 ) -> Path:
     """Write OUT/lora.safetensors if `rank` is given, else a complete OUT/weights.
 
+    Of a student, OUT/weights also links the LoRA and its base.
+
     `start` is the weights folder that the training started from: the base of the LoRA, or the
     source of untrained networks. All processes of the training call it with the same arguments.
     """
     import jax
 
+    from egosim_jax.configs.model import metadata_of
     from egosim_jax.io import weights
     from egosim_jax.io.mapped import read_safetensors
     from egosim_jax.models import lora
@@ -181,8 +228,18 @@ def write_trained(
                 changes[name] = gathered - before[name].array().astype(gathered.dtype)
         if jax.process_index() == 0:
             weights.write(
-                path, lora.tensors(changes), metadata=lora.metadata(model.name, base=base)
+                path,
+                lora.tensors(changes),
+                metadata={
+                    **lora.metadata(model.name, base=base),
+                    **metadata_of("dit", model.chunks),
+                },
             )
+            if model.chunks is not None:
+                (folder := out / "weights").mkdir(exist_ok=True)
+                (folder / weights.STUDENT).unlink(missing_ok=True)
+                (folder / weights.STUDENT).symlink_to(path.resolve())
+                weights.link_others(folder, start)
         return path
     folder = out / "weights"
     trained.save(folder, dtype=model.dit.dtype)

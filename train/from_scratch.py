@@ -24,7 +24,7 @@ from egosim_jax.runtime.terminal import printable
 from egosim_jax.train.config import TrainConfig, WeightsDtype, resume_mutable
 from egosim_jax.train.distributed import require_single_process, stop_if_preempted
 from egosim_jax.train.recipe import Recipe
-from egosim_jax.train.update import Stage
+from egosim_jax.train.task import Stage
 from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:

@@ -27,9 +27,11 @@ from egosim_jax.data.loader import Loader, make_loader, one_pass
 from egosim_jax.data.mixing import Mixture, open_shards
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.io.checkpoint import Checkpoints
+from egosim_jax.io.digest import sha256
 from egosim_jax.io.run import open_folder, write_json
 from egosim_jax.io.weights import hashes, place
 from egosim_jax.models.layers import LowRankParam, init_sharded
+from egosim_jax.models.lora import state_of as lora_state
 from egosim_jax.runtime.command import CommandExit, ExitCode
 from egosim_jax.sharding import assemble, batch_sharding, make_mesh, parts, process_rows
 from egosim_jax.train.config import TrainConfig, numerics_only, resume_mutable
@@ -37,7 +39,8 @@ from egosim_jax.train.distributed import count_distinct, is_preempted
 from egosim_jax.train.metric_writers import Console, JsonLines, TensorBoard, WandB, Writer
 from egosim_jax.train.monitor import Clock, Samples, SkipMonitor, Watchdog
 from egosim_jax.train.run_page import TIMES, write_page
-from egosim_jax.train.update import Programs, Task, TrainState, mean_metrics, mean_validation
+from egosim_jax.train.task import Distillation, Task
+from egosim_jax.train.update import Programs, TrainState, mean_metrics, mean_validation
 from egosim_jax.types import InputError
 
 
@@ -49,20 +52,27 @@ def train(
     validation: Path | None,
     out: Path,
     weights: Path | None = None,
+    lora: Path | None = None,
+    teacher: Path | None = None,
     samples: Samples | None = None,
     run_folder: Path | None = None,
 ) -> Any:
     """Train `task` on the shards in `data`, resuming the run in `out`, and return the networks.
 
     `validation` is a folder of shards to validate on, with fixed noise. `weights` is a folder to
-    start from instead of random weights. OUT gets config.json, environment.json, metrics.jsonl,
-    times.json, checkpoints/ and samples/. `run_folder`, by default OUT, gets index.html, the page
-    of all stages of the run. All processes of a run call this with the same arguments; the first
-    one writes.
+    start from instead of random weights, `lora` a LoRA of it to train further. `teacher` is the
+    folder of a distillation's teacher, by default the student at its start. OUT gets config.json,
+    environment.json, metrics.jsonl, times.json, checkpoints/ and samples/. `run_folder`, by default
+    OUT, gets index.html, the page of all stages of the run. All processes of a run call this with
+    the same arguments; the first one writes.
     """
     training.check_packages()
     digests = None if weights is None else hashes(weights)
     settings = {"task": task, "training": training, "weights": digests}
+    if lora is not None:
+        settings["lora"] = sha256(lora)
+    if teacher is not None:
+        settings["teacher"] = hashes(teacher, only=["dit"])
     mutable = [*resume_mutable("training"), *numerics_only(task, "task")]
     open_folder(out, settings, mutable=mutable)
     mesh, source = make_mesh(training.mesh), open_shards(data)
@@ -73,7 +83,7 @@ def train(
     with jax.set_mesh(mesh), ExitStack() as stack:
         run = Run(task, training, programs, source, out, stack)
         run.compile()
-        state = run.start(weights)
+        state = run.start(weights, lora, teacher)
         log0(startup_message(state, training, out))
         for name, digest in (digests or {}).items():
             log0(f"{out}: from {name} sha256 {digest[:16]}")
@@ -148,14 +158,17 @@ class Run:
         saved = [step for step in range(done + 1, steps + 1) if step % every == 0 or step == steps]
         self.checkpoints.check_room(self.programs.state, saved)
 
-    def start(self, weights: Path | None) -> TrainState:
+    def start(self, weights: Path | None, lora: Path | None, teacher: Path | None) -> TrainState:
         """Return the state of the newest checkpoint, or the initial state."""
         with self.clock.phase("start"):
             loaded = None
             if weights is not None and (self.frozen or not self.checkpoints.steps):
                 loaded = self._load(weights)
             if not self.checkpoints.steps:
-                return self._initial_state(loaded)
+                if lora is not None:
+                    low_rank = lora_state(lora, self.programs.state.params)
+                    loaded = nnx.merge_state(loaded or nnx.State({}), low_rank)
+                return self._initial_state(loaded, teacher)
             state = _placed(self.programs.state, self.programs.state_sharding)
             return self.checkpoints.restore(state, self.batches, fallback=self.training.fallback)
 
@@ -257,9 +270,7 @@ class Run:
     def _load(self, weights: Path) -> nnx.State:
         """Load the frozen weights of a folder; return its weights that are trained further."""
         programs = self.programs
-        start = nnx.Not(LowRankParam)  # no weights folder has the LoRA: it starts at random
-        trained, _ = nnx.split_state(programs.state.params, start, ...)
-        sharding, _ = nnx.split_state(programs.state_sharding.params, start, ...)
+        trained, sharding = self._trained()
         placed = place(
             weights,
             nnx.merge_state(self.frozen, trained),
@@ -269,9 +280,24 @@ class Run:
         self.frozen, loaded = nnx.split_state(placed, lambda path, _: path in frozen, ...)
         return loaded
 
-    def _initial_state(self, loaded: nnx.State | None) -> TrainState:
+    def _trained(self) -> tuple[nnx.State, nnx.State]:
+        """Return shapes and shardings of the trained weights that a weights folder has.
+
+        No weights folder has the LoRA.
+        """
+        held = nnx.Not(LowRankParam)
+        programs = self.programs
+        trained, _ = nnx.split_state(programs.state.params, held, ...)
+        sharding, _ = nnx.split_state(programs.state_sharding.params, held, ...)
+        return trained, sharding
+
+    def _initial_state(self, loaded: nnx.State | None, teacher: Path | None) -> TrainState:
         """Return the state before the first update; weights that were not loaded are random."""
         sharding, params = self.programs.state_sharding, self.programs.state.params
+        if isinstance(self.task, Distillation):
+            given = None if teacher is None else place(teacher, *self._trained())
+            create = partial(self.programs.create, loaded, given)
+            return init_sharded(create, out_shardings=sharding)
         if loaded is None or len(jax.tree.leaves(loaded)) < len(jax.tree.leaves(params)):
             create = partial(self.programs.create, loaded)
             return init_sharded(create, out_shardings=sharding)

@@ -30,8 +30,9 @@ from egosim_jax.sharding import (
     process_rows,
     row_groups,
 )
+from egosim_jax.train.task import Stage
 from egosim_jax.train.tasks.denoising import Denoising
-from egosim_jax.train.update import Programs, Stage
+from egosim_jax.train.update import Programs
 from egosim_jax.types import MeshConfig
 
 ANNOUNCEMENT = "looking for other settings that fit, which takes minutes; --no-search skips it"

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from egosim_jax.io.executables import share_with_jax
-from egosim_jax.train.update import Stage
+from egosim_jax.train.task import Stage
 from egosim_jax.types import InputError
 
 

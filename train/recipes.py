@@ -12,6 +12,7 @@ from egosim_jax.train.from_scratch import FromClips
 from egosim_jax.train.from_tabletop import FromTabletop
 from egosim_jax.train.recipe import Recipe
 from egosim_jax.train.refine_vae import RefineVAE
+from egosim_jax.train.students import STUDENTS
 from egosim_jax.types import InputError
 
 _FULL = TrainConfig(
@@ -297,6 +298,7 @@ RECIPES: dict[str, tuple[str, Recipe]] = {
     "egosim_14b_robot": ("Train EgoSim's 14B transformer on clips of a robot.", EGOSIM_14B_ROBOT),
     "egosim_14b_fewshot": ("Adapt EgoSim's 14B transformer to a few clips.", EGOSIM_14B_FEWSHOT),
     "egosim_14b_lora": ("Train a LoRA of EgoSim's 14B transformer.", EGOSIM_14B_LORA),
+    **STUDENTS,
 }
 """Recipes by name, each with its line of the help."""
 

@@ -26,7 +26,7 @@ from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.train.config import TrainConfig, WeightsDtype, resume_mutable
 from egosim_jax.train.distributed import require_single_process
 from egosim_jax.train.recipe import Recipe
-from egosim_jax.train.update import Stage
+from egosim_jax.train.task import Stage
 
 if TYPE_CHECKING:
     from egosim_jax.train.tasks.refining import Refining

@@ -1,4 +1,4 @@
-"""One training update: its task, its state, its pure functions and their compiled form.
+"""One training update: its state, its pure functions and their compiled form.
 
     (state, frozen weights, batch)  ->  loss and gradients  ->  guard  ->  optimizer  ->  state
 
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol, no_type_check, runtime_checkable
+from typing import Any, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -24,9 +24,7 @@ from jaxtyping import Array, Key
 
 from egosim_jax.sharding import batch_sharding, check_batch, constrain, state_sharding
 from egosim_jax.train.config import OptimizerConfig, TrainConfig, learning_rate, make_optimizer
-
-Batch = Mapping[str, jax.Array]
-Metrics = dict[str, jax.Array]
+from egosim_jax.train.task import Batch, Criticized, Distillation, Metrics, Roles, Task
 
 GUARD_WARMUP = 50
 """Updates before the guard compares a gradient norm with the running mean."""
@@ -34,60 +32,6 @@ GRAD_NORM_DECAY = 0.98
 """Decay of the running mean of gradient norms; it averages over about 50 updates."""
 MAX_CONSECUTIVE_SKIPS = 3
 """Number of consecutive skipped updates that stops the run."""
-
-
-@runtime_checkable
-class Task(Protocol):
-    """Networks to train, their examples and their loss."""
-
-    @property
-    def trained(self) -> Any:
-        """The nnx filter of the trained weights; all others are frozen."""
-        ...
-
-    @property
-    def frozen_dtype(self) -> str:
-        """The dtype of the frozen weights."""
-        ...
-
-    def networks(self, rngs: nnx.Rngs) -> nnx.Module:
-        """Return the networks with random weights."""
-        ...
-
-    def examples(self) -> Any:
-        """Return the Grain transform from a record to an example, a dict of arrays, or None."""
-        ...
-
-    def shapes(self, batch: int) -> Mapping[str, jax.ShapeDtypeStruct]:
-        """Return the shapes of a batch of examples, for compilation without data."""
-        ...
-
-    def keys(self, key: Key[Array, ""], batch: int) -> Key[Array, " *keys"]:
-        """Return the random keys of each sample."""
-        ...
-
-    def loss(
-        self, networks: Any, batch: Batch, keys: Key[Array, " *keys"]
-    ) -> tuple[jax.Array, Metrics]:
-        """Return the mean loss of a batch, and further metrics to log."""
-        ...
-
-    def validate(self, networks: Any, batch: Batch) -> Metrics:
-        """Return deterministic metrics of each sample; they depend only on it and its `record`."""
-        ...
-
-    def flops(self, samples: int) -> float:
-        """Return the model FLOPs of an update on `samples` samples; NaN if unknown."""
-        ...
-
-
-class Stage(NamedTuple):
-    """One training of a recipe: its task and its hyper-parameters."""
-
-    task: Task
-    """Networks, examples and loss."""
-    training: TrainConfig
-    """Its hyper-parameters."""
 
 
 @no_type_check
@@ -108,6 +52,12 @@ class TrainState:
     """Number of consecutive skipped updates, int32."""
     ema_params: nnx.State | None
     """Exponential moving average of `params`; None without `ema_decay`."""
+    teacher: nnx.State | None = None
+    """Weights of a distillation's teacher, which no update changes.
+
+    They are part of the state so that a checkpoint has all that a resumed run needs."""
+    critic: TrainState | None = None
+    """State of a distillation's critic."""
 
     @classmethod
     def create(cls, params: nnx.State, config: OptimizerConfig) -> TrainState:
@@ -140,7 +90,8 @@ class TrainState:
         # A geometric mean: a spike hardly moves the mean that the guard compares it with.
         norm = jnp.maximum(norm, jnp.finfo(norm.dtype).tiny)
         mixed = self.grad_norm_ema**GRAD_NORM_DECAY * norm ** (1 - GRAD_NORM_DECAY)
-        return TrainState(
+        return replace(
+            self,
             step=self.step + 1,
             params=params,
             opt_state=opt_state,
@@ -165,38 +116,97 @@ def make_update(
     """Return the update, a function of state, frozen weights and batch.
 
     Its randomness depends only on seed and step. `grad_accum_steps` parts of the batch are
-    processed one after the other and give the same gradient.
+    processed one after the other and give the same gradient. The critic of a distillation is
+    updated first, several times.
     """
-    config, schedule = training.optimizer, learning_rate(training.optimizer, training.steps)
 
     def update(state: TrainState, frozen: nnx.State, batch: Batch) -> tuple[TrainState, Metrics]:
-        def loss(params: nnx.State, batch: Batch, keys: jax.Array) -> tuple[jax.Array, Metrics]:
-            return task.loss(nnx.merge(graph, params, frozen), batch, keys)
-
         # Keys depend on the step, not on a saved key, so a resumed run repeats the noise.
         key = jax.random.fold_in(jax.random.key(training.seed), state.step)
-        keys = task.keys(key, next(iter(batch.values())).shape[0])
-        gradient = jax.value_and_grad(loss, has_aux=True)
-        if training.grad_accum_steps > 1:
-            gradient = accumulate_gradients(gradient, training.grad_accum_steps)
-        (value, metrics), gradients = gradient(state.params, batch, keys)
+        size = next(iter(batch.values())).shape[0]
+        metrics: Metrics = {}
+        if isinstance(task, Criticized) and task.critic is not None:
+            critic, metrics = _update_critic(task, graph, training, state, frozen, batch, key)
+            state = replace(state, critic=critic)
 
-        norm = optax.tree.norm(gradients)
-        valid = jnp.isfinite(value) & jnp.isfinite(norm)
-        if config.skip_grad_norm_factor is not None:
-            limit = config.skip_grad_norm_factor * state.grad_norm_ema
-            valid &= (state.step < GUARD_WARMUP) | (norm <= limit)
-        # The optimizer's own count would lag behind: it does not count skipped updates.
-        rate = jnp.asarray(schedule(state.step), jnp.float32)
-        changed = state.apply_gradients(gradients, norm, rate, training)
-        # `where` drops the NaNs of a bad update: the optimizer state stays finite, too.
-        state = jax.tree.map(
-            lambda new, old: jnp.where(valid, new, old), changed, state.skip_update()
-        )
-        own = {"loss": value, "grad_norm": norm, "lr": rate}
-        return state, {**own, "consecutive_skips": state.consecutive_skips, **metrics}
+        def loss(params: nnx.State, batch: Batch, keys: jax.Array) -> tuple[jax.Array, Metrics]:
+            networks: Any = nnx.merge(graph, params, frozen)
+            if isinstance(task, Distillation):
+                networks = _roles(graph, replace(state, params=params), frozen)
+            return task.loss(networks, batch, keys)
+
+        state, own = advance(state, loss, batch, task.keys(key, size), training)
+        return state, {**own, **metrics}
 
     return update
+
+
+def advance(
+    state: TrainState,
+    loss: Callable[[nnx.State, Batch, jax.Array], tuple[jax.Array, Metrics]],
+    batch: Batch,
+    keys: Key[Array, " *keys"],
+    training: TrainConfig,
+) -> tuple[TrainState, Metrics]:
+    """Return the state after an update by the gradient of `loss`, and the metrics."""
+    config, schedule = training.optimizer, learning_rate(training.optimizer, training.steps)
+    gradient = jax.value_and_grad(loss, has_aux=True)
+    if training.grad_accum_steps > 1:
+        gradient = accumulate_gradients(gradient, training.grad_accum_steps)
+    (value, metrics), gradients = gradient(state.params, batch, keys)
+
+    norm = optax.tree.norm(gradients)
+    valid = jnp.isfinite(value) & jnp.isfinite(norm)
+    if config.skip_grad_norm_factor is not None:
+        limit = config.skip_grad_norm_factor * state.grad_norm_ema
+        valid &= (state.step < GUARD_WARMUP) | (norm <= limit)
+    # The optimizer's own count would lag behind: it does not count skipped updates.
+    rate = jnp.asarray(schedule(state.step), jnp.float32)
+    changed = state.apply_gradients(gradients, norm, rate, training)
+    # `where` drops the NaNs of a bad update: the optimizer state stays finite, too.
+    state = jax.tree.map(lambda new, old: jnp.where(valid, new, old), changed, state.skip_update())
+    own = {"loss": value, "grad_norm": norm, "lr": rate}
+    return state, {**own, "consecutive_skips": state.consecutive_skips, **metrics}
+
+
+def _update_critic(
+    task: Criticized,
+    graph: nnx.GraphDef,
+    training: TrainConfig,
+    state: TrainState,
+    frozen: nnx.State,
+    batch: Batch,
+    key: Key[Array, ""],
+) -> tuple[Any, Metrics]:
+    """Return the critic's state after its updates on a batch, each with its own noise."""
+    config: Any = task.critic
+    before: Any = state.critic
+    steps = config.updates * training.steps
+    own = replace(training, optimizer=config.optimizer, steps=steps)
+
+    def step(critic: TrainState, number: jax.Array) -> tuple[TrainState, Metrics]:
+        def loss(params: nnx.State, batch: Batch, keys: jax.Array) -> tuple[jax.Array, Metrics]:
+            changed = replace(state, critic=replace(critic, params=params))
+            return task.critic_loss(_roles(graph, changed, frozen), batch, keys)
+
+        size = next(iter(batch.values())).shape[0]
+        keys = task.keys(jax.random.fold_in(key, number), size)
+        return advance(critic, loss, batch, keys, own)
+
+    critic, rows = jax.lax.scan(step, before, jnp.arange(1, config.updates + 1))
+    means = {f"critic_{name}": rows[name].mean() for name in ("loss", "grad_norm")}
+    return critic, means
+
+
+def _roles(graph: nnx.GraphDef, state: TrainState, frozen: nnx.State) -> Roles:
+    """Return the networks of a distillation; gradients reach what `state` was replaced with."""
+    critic = state.critic
+    return Roles(
+        student=nnx.merge(graph, state.params, frozen),
+        average=nnx.merge(graph, jax.lax.stop_gradient(state.eval_params), frozen),
+        teacher=nnx.merge(graph, state.teacher, frozen),
+        critic=None if critic is None else nnx.merge(graph, critic.params, frozen),
+    )
 
 
 def accumulate_gradients(gradient: Callable[..., Any], parts: int) -> Callable[..., Any]:
@@ -264,6 +274,16 @@ def mean_validation(rows: Iterable[Mapping[str, jax.Array]]) -> tuple[dict[str, 
     return {f"validation_{name}": total / samples for name, total in totals.items()}, int(samples)
 
 
+def _with_roles(state: TrainState, task: Distillation, teacher: nnx.State) -> TrainState:
+    """Return a distillation's state before the first update; the critic starts as the teacher."""
+    critic = None
+    if task.critic is not None:
+        critic = TrainState.create(jax.tree.map(jnp.copy, teacher), task.critic.optimizer)
+    # Copies: the state is donated, so no array may be in it twice.
+    kept: Any = jax.tree.map(lambda leaf: jnp.array(leaf, task.frozen_dtype), teacher)
+    return replace(state, teacher=kept, critic=critic)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Programs:
     """The jitted update and validation of a task, with the shapes and shardings of their arguments.
@@ -274,7 +294,9 @@ class Programs:
     graph: nnx.GraphDef
     """Graph of the task's networks."""
     create: Callable[..., TrainState]
-    """Return the initial state; weights that were not loaded are random."""
+    """Return the initial state, from loaded weights of the student and of its teacher.
+
+    Weights that were not loaded are random. Without a teacher, it is the student at its start."""
     state: TrainState
     """Shape and dtype of each array of the state."""
     state_sharding: Any
@@ -302,11 +324,14 @@ class Programs:
             lambda leaf: jax.ShapeDtypeStruct(leaf.shape, task.frozen_dtype), frozen
         )
 
-        def create(loaded: nnx.State | None = None) -> TrainState:
-            params = nnx.state(task.networks(nnx.Rngs(training.seed)), task.trained)
-            if loaded is not None:
-                params = nnx.merge_state(params, loaded)
-            return TrainState.create(params, training.optimizer)
+        def create(loaded: nnx.State | None = None, teacher: nnx.State | None = None) -> TrainState:
+            new = nnx.state(task.networks(nnx.Rngs(training.seed)), task.trained)
+            params = new if loaded is None else nnx.merge_state(new, loaded)
+            state = TrainState.create(params, training.optimizer)
+            if isinstance(task, Distillation):
+                start = params if teacher is None else nnx.merge_state(new, teacher)
+                state = _with_roles(state, task, start)
+            return state
 
         state, placed = jax.eval_shape(create), batch_sharding(mesh)
         sharding, frozen_sharding = state_sharding(mesh, state), state_sharding(mesh, frozen)

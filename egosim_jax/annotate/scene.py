@@ -31,7 +31,7 @@ from egosim_jax.rendering import POINT_PX
 from egosim_jax.rendering.reference import splat
 from egosim_jax.state.depth import state_from_depth
 from egosim_jax.state.instances import find_objects
-from egosim_jax.types import SceneState, Triplet
+from egosim_jax.types import SceneState, Triplet, object_name
 
 MOVED = "moved object"
 """Name of an object that a hand moves, if no network names it."""
@@ -231,7 +231,7 @@ def join_objects(
             new = int(known[0][known[1].argmax()])
         else:
             new = max(int(joined.max()), *named, 0) + 1
-            named[new] = f"object {new}"
+            named[new] = object_name(new, {})
         joined[own & (joined == 0)] = new
     return joined, named
 

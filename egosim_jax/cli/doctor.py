@@ -80,7 +80,7 @@ class Doctor:
     def _folders(self) -> list[Path]:
         from egosim_jax import configs
 
-        shipped = (configs.shipped_weights(name) for name in configs.names())
+        shipped = dict.fromkeys(configs.shipped_weights(name) for name in configs.names())
         return [*(folder for folder in shipped if folder), *(self.weights or _default_folders())]
 
 
@@ -159,7 +159,7 @@ def _rows(folder: Path) -> Iterator[tuple[str, ...]]:
     from egosim_jax.io.mapped import read_metadata
     from egosim_jax.io.weights import hashes
 
-    for network, digest in hashes(folder).items():
+    for network, digest in hashes(folder, student=True).items():
         file = folder / f"{network}.safetensors"
         config = read_metadata(file).get("config", folder.name)
         yield str(folder), config, network, f"{file.stat().st_size / 1e9:.3f}", digest[:16]

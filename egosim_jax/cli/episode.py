@@ -11,7 +11,7 @@ import tyro
 
 from egosim_jax.rendering import RendererName
 from egosim_jax.runtime.command import ExitCode
-from egosim_jax.types import InputError, check_counts, check_seed
+from egosim_jax.types import InputError, check_counts, check_seed, object_name
 
 if TYPE_CHECKING:
     import numpy as np
@@ -313,7 +313,7 @@ class ShowEpisode:
         state, cameras = episode.state, episode.actions[0].cameras
         view = rendering.get(self.renderer).render(state, cameras, point_px=rendering.POINT_PX)
         numbers = sorted(set(state.object_ids[state.object_ids > 0].tolist()))
-        listed = ", ".join(state.names.get(n, f"object {n}") for n in numbers)
+        listed = ", ".join(object_name(n, state.names) for n in numbers)
         title = f"objects: {listed or 'none'}"
         return SheetClip(title, [draw_objects(view, state.names)])
 

@@ -17,6 +17,7 @@ from egosim_jax.experiments.config import (
     Policies,
     Rank,
     RealTiny,
+    Students,
     Tabletop,
     Update,
 )
@@ -25,6 +26,7 @@ from egosim_jax.runtime.command import ExitCode
 MODULES = {
     Tabletop: "tabletop",
     Continuous: "continuous",
+    Students: "students",
     Update: "update",
     Embodiment: "embodiment",
     LookAway: "look_away",
@@ -44,6 +46,7 @@ class Experiment:
     command: (
         Annotated[Tabletop, tyro.conf.subcommand("tabletop")]
         | Annotated[Continuous, tyro.conf.subcommand("continuous")]
+        | Annotated[Students, tyro.conf.subcommand("students")]
         | Annotated[Update, tyro.conf.subcommand("update")]
         | Annotated[Embodiment, tyro.conf.subcommand("embodiment")]
         | Annotated[LookAway, tyro.conf.subcommand("look_away")]

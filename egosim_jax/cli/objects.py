@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from egosim_jax.types import InputError
+from egosim_jax.types import InputError, object_name
 
 if TYPE_CHECKING:
     import numpy as np
@@ -85,7 +85,7 @@ def names_of(ids: np.ndarray | None, known: Mapping[int, str], given: Sequence[s
     import numpy as np
 
     numbers = [] if ids is None else np.unique(ids[ids > 0]).tolist()
-    names = {number: known.get(number, f"object {number}") for number in numbers}
+    names = {number: object_name(number, known) for number in numbers}
     for text in given:
         number, equals, name = text.partition("=")
         if not (equals and name.strip() and number.isdecimal() and int(number) in names):

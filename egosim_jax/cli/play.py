@@ -48,6 +48,8 @@ class Play:
     """Folder of weights; by default the shipped or fetched ones."""
     perception: str = "classical"
     """Perception pipeline, with its options (`egosim simulate --help`)."""
+    update_every: Literal["clip", "chunk"] = "clip"
+    """Update the state after each clip or, with a causal student, after each chunk of a clip."""
     steps: int | None = None
     """Denoising steps, instead of the model's."""
     port: int = 8080
@@ -64,17 +66,18 @@ class Play:
         self._check_port()
         from egosim_jax import configs
         from egosim_jax.generation.generator import Generator
-        from egosim_jax.generation.stream import Streamer
         from egosim_jax.interactive.env.action_spec import ActionSpec
         from egosim_jax.interactive.env.backends import GeneratedWorld
         from egosim_jax.interactive.play.played_episode import PlayedEpisode
         from egosim_jax.interactive.play.viewer import Page
         from egosim_jax.io.atomic import lock_folder
         from egosim_jax.io.executables import share_with_jax
+        from egosim_jax.simulation.simulator import check_update_every
 
         share_with_jax()
         config = configs.get(self.config)
         config = replace(config, steps=self.steps or config.steps)
+        check_update_every(self.update_every, config.chunk_frames, config.name, self.perception)
         print(
             f"loading and compiling {self.config}: the first start takes minutes",
             file=sys.stderr,
@@ -82,18 +85,18 @@ class Play:
         )
         weights = configs.weights_of(self.config, self.weights)
         generator = Generator.load(config, weights)
-        streamer = Streamer(generator)
         world = GeneratedWorld(
-            generator=streamer,
+            generator=generator,
             video=generator.config.video,
             perception=self.perception,
             trained_on=configs.trained_on(self.config, weights),
+            update_every=self.update_every,
         )
         spec = ActionSpec(sides=(self.hand,), camera=True)
         start = self._start(world, spec)
         if note := configs.scene_warning(world.trained_on, start.state.provenance):
             print(note, file=sys.stderr, flush=True)
-        streamer.compile()
+        generator.compile(1, streamed=True)
 
         def begin(seed: int) -> PlayedEpisode:
             check_seed(seed, name="table")

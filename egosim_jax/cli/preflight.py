@@ -10,7 +10,7 @@ from math import prod
 from typing import TYPE_CHECKING, Any
 
 from egosim_jax.runtime.command import ExitCode
-from egosim_jax.types import MeshConfig, check_counts
+from egosim_jax.types import InputError, MeshConfig, check_counts
 
 if TYPE_CHECKING:
     from flax import nnx
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 class Preflight:
     """Compile `generate` for a machine that need not be present; report if it fits in memory.
 
-    Prints, for encoding, denoising and decoding: memory per device (with the weights of all
-    networks), the largest arrays, collectives, FLOPs and the roofline time. Exit code 1 if a
-    program does not fit.
+    Prints, for encoding, denoising and decoding, or for each chunk of a causal student: memory per
+    device (with the weights of all networks), the largest arrays, collectives, FLOPs and the
+    roofline time. Exit code 1 if a program does not fit.
     """
 
     config: str
@@ -38,6 +38,12 @@ class Preflight:
     """Clips generated together; by default one per group of devices that share a clip."""
     steps: int | None = None
     """Denoising steps, instead of the model's."""
+    chunks: tuple[int, ...] = ()
+    """Latent frames of each chunk, for a causal student of the model; by default the model's own.
+
+    4 4 4 4 are chunks of egosim_14b."""
+    first_steps: int | None = None
+    """Denoising steps of the first chunk; by default as many as the other chunks have."""
     mesh: MeshConfig = field(default_factory=lambda: MeshConfig(data=-1, fsdp=1))
     """Layout of the devices; by default each generates separate clips.
 
@@ -50,6 +56,7 @@ class Preflight:
         """Compile the programs and print their reports."""
         from egosim_jax import configs
         from egosim_jax.io.executables import share_with_jax
+        from egosim_jax.models.chunks import Chunks
         from egosim_jax.preflight import report as reports
         from egosim_jax.preflight.targets import compile_offline, find
         from egosim_jax.sharding import make_mesh, parts
@@ -59,6 +66,11 @@ class Preflight:
         share_with_jax()
         config, target = configs.get(self.config), find(self.target)
         config = replace(config, steps=self.steps or config.steps)
+        if self.chunks:
+            chunks = Chunks(sizes=self.chunks, first_steps=self.first_steps)
+            config = replace(config, chunks=chunks)
+        elif self.first_steps is not None:
+            raise InputError("--first-steps needs chunks: give their sizes. (--chunks)")
         mesh = make_mesh(self.mesh, target.devices)
         size = self.batch_size or parts("batch", mesh)
         found = {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -44,7 +44,7 @@ class Simulate:
 
     help_groups: ClassVar[HelpGroups] = {
         "scene": ("robot", "first_frame"),
-        "loop": ("weights", "steps", "perception", "update", "renderer"),
+        "loop": ("weights", "steps", "perception", "update", "update_every", "renderer"),
     }
     config: str = "tabletop"
     """Name of the model (`egosim models list`)."""
@@ -61,7 +61,9 @@ class Simulate:
 
     MODULE:NAME is a pipeline of your own. 'NAME --help' lists the options of a pipeline."""
     update: Literal["full", "none"] = "full"
-    """Update the state after each clip, or keep the initial state."""
+    """Update the state, or keep the initial state."""
+    update_every: Literal["clip", "chunk"] = "clip"
+    """Update the state after each clip or, with a causal student, after each chunk of a clip."""
     renderer: RendererName = "jax"
     """Renderer of the view and the hands; numpy is the slow reference."""
     robot: bool = False
@@ -86,7 +88,7 @@ class Simulate:
         from egosim_jax.perception import registry
         from egosim_jax.perception.recorded import RecordedConfig
         from egosim_jax.simulation.rollout import OUTPUTS, Rollout
-        from egosim_jax.simulation.simulator import Simulator
+        from egosim_jax.simulation.simulator import Simulator, check_update_every
 
         check_counts({"--clips": self.clips, "--steps": self.steps})
         check_seed(self.seed)
@@ -99,6 +101,7 @@ class Simulate:
         config = configs.get(self.config)
         config = replace(config, steps=self.steps or config.steps)
         weights = configs.weights_of(self.config, self.weights)
+        check_update_every(self.update_every, config.chunk_frames, config.name, self.perception)
         folder = self.out or Path("runs") / f"simulate_{self.seed}"
         episode = self._episode(config.video)
         perception = None
@@ -110,7 +113,7 @@ class Simulate:
         made_of = {
             "simulate": self,
             "model": config,
-            "weights": hashes(weights),
+            "weights": hashes(weights, student=config.chunks is not None),
             "episode": fingerprint(episode),
         }
         Journal(folder, outputs=OUTPUTS)  # refuses a damaged journal before the weights are loaded
@@ -129,6 +132,7 @@ class Simulate:
             generator=Generator.load(config, weights, renderer=rendering.get(self.renderer)),
             perception=perception,
             fps=config.video.fps,
+            update_every=self.update_every,
         )
         steps = Rollout(simulator, folder).run(
             episode.state, episode.actions, seed=self.seed, first_frame=episode.first_frame
@@ -221,6 +225,7 @@ class _Outputs:
                     "clip": number,
                     "action": action.prompt,
                     "notes": list(step.notes),
+                    **({} if step.latency is None else asdict(step.latency)),
                     **self._score(step, action, truth),
                 }
             )
@@ -236,7 +241,11 @@ class _Outputs:
             state = step.state
             print(folder / f"clip_{number}.mp4")
             about = f"clip {number}/{len(truths)}: {action.prompt}"
-            print(printable(f"{about} ({time.monotonic() - then:.1f} s)"), file=sys.stderr)
+            times = f"{time.monotonic() - then:.1f} s"
+            if step.latency is not None:
+                first, last = step.latency.first_frame_s, step.latency.last_frame_s
+                times += f"; first frame after {first:.1f} s, last after {last:.1f} s"
+            print(printable(f"{about} ({times})"), file=sys.stderr)
             for note in step.notes:
                 print(printable(f"  {note}"), file=sys.stderr)
             then = time.monotonic()

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 
 from egosim_jax.io import hub
 from egosim_jax.io.bounded import read_json
-from egosim_jax.io.weights import check_folder
+from egosim_jax.io.weights import STUDENT, check_folder
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -85,7 +85,12 @@ def _module(name: str) -> ModuleType:
 
 
 def shipped_weights(name: str) -> Path | None:
-    """Return the folder of the shipped weights, or None."""
+    """Return the folder of the shipped weights, or None.
+
+    A student's weights are in its teacher's folder.
+    """
+    if name in names() and (teacher := getattr(_module(name), "SHIPPED_WITH", None)):
+        return SHIPPED / teacher if (SHIPPED / teacher / STUDENT).is_file() else None
     folder = SHIPPED / name
     return folder if folder.is_dir() else None
 

@@ -35,6 +35,7 @@ from egosim_jax.models import (
     VideoCodec,
     VideoCodecConfig,
     abstract,
+    lora,
 )
 from egosim_jax.models.chunks import Chunks
 from egosim_jax.models.layers import init_sharded
@@ -164,6 +165,7 @@ class ModelConfig:
         for option, value, usual in (
             ("guidance.scale", self.guidance.scale, 1.0),
             ("strength", self.strength, None),
+            ("encoding_noise", self.encoding_noise, None),
         ):
             if value != usual:
                 raise InputError(
@@ -237,6 +239,15 @@ class ModelConfig:
     def latent_shape(self) -> tuple[int, int, int]:
         """Frames, rows and columns of a clip's latents."""
         return self.grid.latent_shape(self.video)
+
+    @property
+    def chunk_frames(self) -> tuple[int, ...]:
+        """Frames of each chunk of a clip; a model that makes clips at once has one chunk."""
+        if self.chunks is None:
+            return (self.video.frames,)
+        # The first latent frame of a clip encodes one frame.
+        stride, (first, *others) = self.vae.temporal_stride, self.chunks.sizes
+        return (1 + stride * (first - 1), *(stride * size for size in others))
 
     @property
     def networks(self) -> Mapping[Name, NetworkConfig]:
@@ -334,16 +345,19 @@ class Networks(nnx.Module):
 
         On a mesh, each device reads only its own part of the weights. Raises `InputError` with
         every path that is missing, unknown or of another shape, or if the denoiser makes other
-        chunks.
+        chunks. A student may be a LoRA of the folder's denoiser, in `student.safetensors`.
         """
         networks, folder = cls.abstract(config, only=only), Path(folder)
         if not folder.is_dir():
             raise InputError(f"{folder} is not a folder of weights. (--weights)")
         for name, network in networks.parts().items():
             file = folder / f"{name}.safetensors"
+            student = None
             if name == "dit" and file.is_file():
-                weights.check_chunks(file, metadata_of("dit", config.chunks).get(weights.CHUNKS))
+                student = weights.student_of(file, metadata_of(name, config.chunks))
             weights.load(file, network, mesh=mesh)
+            if student is not None:
+                lora.merge(network, student, base=weights.hashes(folder, only=["dit"])["dit"])
         return networks
 
     def save(self, folder: Path, *, dtype: str | None = None) -> None:

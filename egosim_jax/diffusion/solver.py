@@ -122,6 +122,44 @@ def integrate_keeping(
     return state.x, kept
 
 
+class Visited(NamedTuple):
+    """Latents before each step of a solver, and what the network returned for them."""
+
+    latents: Float[Array, "s b f h w c"]
+    """Input of each step."""
+    outputs: Float[Array, "s b f h w c"]
+    """Prediction of each step."""
+    timesteps: Float[Array, " s"]
+    """Timestep of each step."""
+
+
+def integrate_visiting(
+    denoise: Callable[[jax.Array, jax.Array], tuple[jax.Array, Kept]],
+    noise: Float[Array, "b f h w c"],
+    *,
+    process: Process,
+    solver: Solver,
+    steps: SupportsIndex | Sequence[int | float],
+    keys: Key[Array, " b"] | None = None,
+) -> tuple[Float[Array, "b f h w c"], Kept, Visited]:
+    """Return latents and last result as `integrate_keeping` does, and what all steps visited."""
+    rows = jax.tree.map(jnp.asarray, _rows(process, solver, steps, keys))
+
+    def seen(x: jax.Array, t: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array, Kept]]:
+        output, kept = denoise(x, t)
+        return output, (x, output.astype(jnp.float32), kept)
+
+    def advance(carry: Any, row: tuple) -> tuple[Any, tuple[jax.Array, jax.Array]]:
+        state, (x, output, kept) = _advance(seen, process, solver, carry[0], row)
+        return (state, kept), (x, output)
+
+    # One program for all steps: the last results are carried, not appended for each step.
+    _, empty = jax.eval_shape(denoise, noise, jnp.zeros(len(noise)))
+    empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), empty)
+    (state, kept), visited = jax.lax.scan(advance, (solver.start(noise), empty), rows)
+    return state.x, kept, Visited(*visited, timesteps=rows[0])
+
+
 def _rows(
     process: Process,
     solver: Solver,

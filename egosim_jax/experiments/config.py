@@ -42,7 +42,8 @@ class ModelExperiment:
         config = configs.get(self.config)
         config = replace(config, steps=self.steps or config.steps)
         weights = configs.weights_of(self.config, self.weights)
-        record = {"experiment": self, "model": config, "weights": hashes(weights)}
+        digests = hashes(weights, student=config.chunks is not None)
+        record = {"experiment": self, "model": config, "weights": digests}
         open_folder(self.out, record, mutable=["experiment.weights"])
         return Generator.load(config, weights)
 
@@ -87,6 +88,38 @@ class Continuous(ModelExperiment):
     """Seed of the first sequence; the shipped model was trained on seeds from 1000 on."""
     ids: Ids = "given"
     """Object ids in the first state of classical perception."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Students(ModelExperiment):
+    """Compare a causal student with its teacher on held-out scenes, and over consecutive clips.
+
+    The rows: the teacher with several numbers of denoising steps, its weights used chunk by chunk,
+    the given stages of training, and the student. Prints means, the student's differences from each
+    row, and the clips of the loop with `classical` updates. Writes report.json, curves.png and
+    contact_sheet.png. The same command resumes the loop.
+    """
+
+    config: str = "tabletop_student"
+    """Name of the student."""
+    teacher: str = "tabletop"
+    """Name of the teacher, whose weights are in the student's folder."""
+    teacher_steps: tuple[int, ...] = (2, 4, 10)
+    """Denoising steps of the teacher, a row for each."""
+    stages: tuple[str, ...] = ()
+    """Stages of the student's training, each as NAME=FILE; the file is a run's lora.safetensors."""
+    scenes: int = 24
+    """Number of scenes."""
+    first_scene: int = 100
+    """Seed of the first scene; the shipped model was trained on seeds from 1000 on."""
+    batch_size: int = 8
+    """Number of clips generated together."""
+    sequences: int = 12
+    """Number of sequences in the loop; 0: no loop."""
+    first_sequence: int = 600
+    """Seed of the first sequence."""
+    clips: int = 10
+    """Number of clips per sequence."""
 
 
 @dataclass(frozen=True, kw_only=True)

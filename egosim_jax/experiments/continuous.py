@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from egosim_jax.evaluation.metrics.loop import DEFINITIONS, MEASURES, score_step
 from egosim_jax.evaluation.metrics.report import Summary, paired_differences, print_table, summarize
-from egosim_jax.experiments.config import Continuous
+from egosim_jax.experiments.config import Continuous, Ids
 from egosim_jax.generation.generator import Generator
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.bounded import read_json
@@ -46,7 +46,16 @@ def run(settings: Continuous) -> None:
     jobs = [(method, seed) for seed in seeds for method in METHODS]
     scores: dict[str, list[Scores]] = {method: [] for method in METHODS}
     for method, seed in track(jobs, "sequences", total=len(jobs)):
-        scores[method].append(_simulate(settings, generator, method, seed))
+        scores[method].append(
+            simulate(
+                generator,
+                settings.out / folder_name(method) / str(seed),
+                seed=seed,
+                clips=settings.clips,
+                perception=METHODS[method],
+                ids=settings.ids,
+            )
+        )
     tables = {
         method: [summarize(clips, MEASURES) for clips in zip(*runs, strict=True)]
         for method, runs in scores.items()
@@ -79,23 +88,32 @@ def folder_name(method: str) -> str:
     return method.replace(", ", "_").replace(" ", "_")
 
 
-def _simulate(settings: Continuous, generator: Generator, method: str, seed: int) -> Scores:
-    """Return the scores of one sequence, cached in its folder."""
-    folder = settings.out / folder_name(method) / str(seed)
+def simulate(
+    generator: Generator,
+    folder: Path,
+    *,
+    seed: int,
+    clips: int,
+    perception: str | None,
+    ids: Ids = "given",
+) -> Scores:
+    """Return the scores of one held-out sequence of clips, cached in its folder.
+
+    Without `perception`, the state is not updated. `ids` are those that `classical` starts with.
+    """
     path = folder / "scores.json"
     if path.exists():
         return read_json(path)
-    video, name = generator.config.video, METHODS[method]
-    clips = list(make_sequence(seed, spec=video, clips=settings.clips))
-    episode = to_episode(clips, fps=video.fps)
+    video = generator.config.video
+    sequence = list(make_sequence(seed, spec=video, clips=clips))
+    episode = to_episode(sequence, fps=video.fps)
     start = episode.state
-    if settings.ids == "none" and name == "classical":
+    if ids == "none" and perception == "classical":
         start = without_ids(start)
-    simulator = Simulator(
-        generator=generator,
-        perception=registry.parse(name).build(episode.observations()) if name else None,
-        fps=video.fps,
-    )
+    found = None
+    if perception is not None:
+        found = registry.parse(perception).build(episode.observations())
+    simulator = Simulator(generator=generator, perception=found, fps=video.fps)
     steps = Rollout(simulator, folder).run(
         start, episode.actions, seed=seed, first_frame=episode.first_frame
     )

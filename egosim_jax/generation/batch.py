@@ -30,7 +30,8 @@ from egosim_jax.data.clips import Policy, check_clip, load_triplet
 from egosim_jax.data.metadata import check_presence
 from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.data.windows import RESULTS, Window, conditions_sha256, read_results
-from egosim_jax.generation.generator import Generator, NonFiniteError, batches
+from egosim_jax.generation.generator import Generator, batches
+from egosim_jax.generation.stream import NonFiniteError
 from egosim_jax.io.atomic import append_line
 from egosim_jax.io.bounded import listing, quote
 from egosim_jax.io.decoding import Decoding
@@ -129,7 +130,9 @@ class BatchJob:
     def open(self) -> None:
         """Record the settings in the folder. Raises `InputError` if it has another job's."""
         self._place()
-        digests = None if self.weights is None else hashes(self.weights)
+        student, digests = self.model.chunks is not None, None
+        if self.weights is not None:
+            digests = hashes(self.weights, student=student)
         if self.lora is not None and digests is not None:
             check_base(self.lora, [digests["dit"]])
         settings = {

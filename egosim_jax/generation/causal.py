@@ -44,6 +44,12 @@ def chunks_of(config: ModelConfig) -> Chunks:
     return config.chunks
 
 
+def steps_of(config: ModelConfig, number: int) -> Any:
+    """Return the denoising steps of a chunk by number: their number, or the timesteps to visit."""
+    first = chunks_of(config).first_steps
+    return config.steps if number or first is None else first
+
+
 def denoise_chunk(
     dit: CausalDenoiser,
     channels: Float[Array, "b f h w c"],
@@ -67,7 +73,7 @@ def denoise_chunk(
         noise,
         process=config.process,
         solver=config.solver,
-        steps=config.steps if number or chunks.first_steps is None else chunks.first_steps,
+        steps=steps_of(config, number),
         keys=own,
     )
     if number == len(chunks.sizes) - 1:  # no later chunk sees the last one
@@ -134,12 +140,14 @@ class ChunkDenoiser:
         return run
 
     def programs(
-        self, condition: Condition, noise: Any, *seeds: Any
+        self, text: Any, image: Any, noise: Any, *seeds: Any
     ) -> Iterator[tuple[str, CompiledFn, tuple]]:
         """Yield name, function and input shapes of each program, by the shapes of a clip."""
-        yield "share", self._share, (condition.text, condition.image)
-        shared, cache = self._share.shapes(condition.text, condition.image)
-        channels = jax.eval_shape(self.config.layout.condition_channels, condition, noise)
+        yield "share", self._share, (text, image)
+        shared, cache = self._share.shapes(text, image)
+        layout = self.config.layout
+        width = layout.channels - layout.count("noisy")
+        channels = jax.ShapeDtypeStruct((*noise.shape[:-1], width), noise.dtype)
         for number, (program, size) in enumerate(
             zip(self._denoise, self.chunks.sizes, strict=True)
         ):

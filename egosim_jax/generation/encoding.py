@@ -50,17 +50,19 @@ def pack(
 
     `seeds` are needed, and kept, only if the encoding draws noise.
     """
-    layout = config.layout
+    batch = {**pack_clip(triplets, config), **pack_videos(triplets, config)}
+    if seeds is not None and config.encoding_noise is not None:
+        batch["seeds"] = last_32_bits(seeds)
+    return batch
+
+
+def pack_clip(triplets: Sequence[Triplet], config: ModelConfig) -> dict[str, np.ndarray]:
+    """Return the arrays of a batch that all frames of a clip share: prompts and images."""
     tokens = config.tokenizer.tokenize([t.prompt for t in triplets])
     batch = {"ids": tokens.ids, "ids_mask": tokens.mask}
     if config.unconditional_prompt is not None:
         null = config.tokenizer.tokenize([config.unconditional_prompt] * len(triplets))
         batch |= {"null_ids": null.ids, "null_mask": null.mask}
-    for name in ("prior", "hands"):
-        if name in layout:
-            batch[name] = np.stack([getattr(t, name) for t in triplets])
-    if "mask" in layout:
-        batch["mask"] = np.stack([layout.pack_mask(t.mask, config.grid) for t in triplets])
     if config.image is not None:
         batch["pixels"] = clip_pixels(
             np.stack([t.first_frame for t in triplets]),
@@ -69,15 +71,39 @@ def pack(
         )
     if (image := config.given_image(triplets)) is not None:
         batch["image"] = image
-    if seeds is not None and config.encoding_noise is not None:
-        batch["seeds"] = last_32_bits(seeds)
     return batch
+
+
+def pack_videos(
+    triplets: Sequence[Triplet], config: ModelConfig, *, continued: bool = False
+) -> dict[str, np.ndarray]:
+    """Return the arrays of a batch with frames; `continued` ones follow earlier frames of a clip.
+
+    The first frame of a clip has its own latent frame, so continued frames number 4k.
+    """
+    layout = config.layout
+    videos = {
+        name: np.stack([getattr(t, name) for t in triplets])
+        for name in ("prior", "hands")
+        if name in layout
+    }
+    if "mask" in layout:
+        masks = [np.concatenate([t.mask[:continued], t.mask]) for t in triplets]
+        packed = [layout.pack_mask(mask, config.grid)[int(continued) :] for mask in masks]
+        videos["mask"] = np.stack(packed)
+    return videos
 
 
 def batch_shapes(size: int, config: ModelConfig) -> dict[str, jax.ShapeDtypeStruct]:
     """Return the shapes and dtypes of `pack`'s result, to compile before there is a batch."""
-    video, layout = config.video, config.layout
-    frames = (video.frames, video.height, video.width, 3)
+    shapes = {**clip_shapes(size, config), **video_shapes(size, config)}
+    if config.encoding_noise is not None:
+        shapes["seeds"] = jax.ShapeDtypeStruct((size,), np.uint32)
+    return shapes
+
+
+def clip_shapes(size: int, config: ModelConfig) -> dict[str, jax.ShapeDtypeStruct]:
+    """Return the shapes and dtypes of `pack_clip`'s result."""
     tokens = (config.tokenizer.max_tokens,)
     shapes: dict[str, tuple[tuple[int, ...], Any]] = {
         "ids": (tokens, np.int32),
@@ -85,16 +111,29 @@ def batch_shapes(size: int, config: ModelConfig) -> dict[str, jax.ShapeDtypeStru
     }
     if config.unconditional_prompt is not None:
         shapes |= {"null_ids": (tokens, np.int32), "null_mask": (tokens, np.bool_)}
-    shapes |= {name: (frames, np.uint8) for name in ("prior", "hands") if name in layout}
-    if "mask" in layout:
-        shapes["mask"] = (*config.latent_shape, layout.count("mask")), np.uint8
     if config.image is not None:
         shapes["pixels"] = (config.image.image_size, config.image.image_size, 3), np.float32
     if (zeros := config.zero_image(1)) is not None:
         shapes["image"] = zeros.shape[1:], zeros.dtype
-    if config.encoding_noise is not None:
-        shapes["seeds"] = (), np.uint32
     return {name: jax.ShapeDtypeStruct((size, *s), dtype) for name, (s, dtype) in shapes.items()}
+
+
+def video_shapes(
+    size: int, config: ModelConfig, chunk: int | None = None
+) -> dict[str, jax.ShapeDtypeStruct]:
+    """Return the shapes and dtypes of `pack_videos`' result, for a clip or a chunk by index."""
+    video, layout = config.video, config.layout
+    frames, (latents, *cells) = video.frames, config.latent_shape
+    if chunk is not None and config.chunks is not None:
+        frames, latents = config.chunk_frames[chunk], config.chunks.sizes[chunk]
+    shape = (size, frames, video.height, video.width, 3)
+    shapes = {
+        name: jax.ShapeDtypeStruct(shape, np.uint8) for name in ("prior", "hands") if name in layout
+    }
+    if "mask" in layout:
+        mask = (size, latents, *cells, layout.count("mask"))
+        shapes["mask"] = jax.ShapeDtypeStruct(mask, np.uint8)
+    return shapes
 
 
 def encode_condition(

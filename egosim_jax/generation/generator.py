@@ -8,7 +8,8 @@ condition's part of the patch embedding do not change between steps: they are co
 scan. The noise is donated. An item's noise depends only on its seed, so a clip does not depend on
 its batch.
 
-A causal student makes its chunks one after the other (`causal.py`).
+A causal student makes its chunks one after the other (`causal.py`), and each of its arrows takes
+one chunk (`stream.py`).
 
 On a mesh (`sharding.py`), data x fsdp splits the batch. Devices along context share the denoising
 of a clip; each of them encodes and decodes the complete clip. If the devices belong to several
@@ -18,7 +19,7 @@ processes, all of them make the same calls and get all clips.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
+from functools import cached_property
 from pathlib import Path
 from typing import TypeVar, cast
 
@@ -35,15 +36,24 @@ from egosim_jax.conditioning.pixels import to_model, to_uint8
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.diffusion.process import DenoiseFn
 from egosim_jax.diffusion.solver import integrate
-from egosim_jax.generation.causal import ChunkDenoiser, chunks_of, denoise_chunks
+from egosim_jax.generation.causal import ChunkDenoiser, denoise_chunks
 from egosim_jax.generation.compiled import CompiledFn
 from egosim_jax.generation.encoding import (
     SOLVER_NOISE,
     batch_shapes,
+    clip_shapes,
     encode_condition,
     keys_for,
     last_32_bits,
     pack,
+)
+from egosim_jax.generation.stream import (
+    CausalCodec,
+    ClipStream,
+    CodecPrograms,
+    NonFiniteError,
+    ViewStream,
+    split_triplet,
 )
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.run import plain
@@ -61,16 +71,6 @@ from egosim_jax.types import (
 )
 
 T = TypeVar("T")
-
-
-class NonFiniteError(FloatingPointError):
-    """Some clips of a batch have NaN or infinite latents; the others are valid."""
-
-    def __init__(self, names: Sequence[str], bad: Sequence[int]):
-        """`names` are the ids of all clips of the batch, `bad` the indices of the failed ones."""
-        failed = [names[n] for n in bad]
-        super().__init__(f"The latents of {failed} are not finite (NaN or infinity).")
-        self.bad = tuple(bad)
 
 
 def denoise(
@@ -127,7 +127,7 @@ class Generator:
         self.mesh = mesh
         self.renderer = renderer
         self.networks = networks = shard_params(networks, mesh)
-        self._encode = CompiledFn(
+        self.encode = CompiledFn(
             lambda networks, batch: encode_condition(networks, batch, config.encoding_noise),
             networks,
             mesh=mesh,
@@ -154,17 +154,24 @@ class Generator:
             cache_key=("denoise", config),
             donate_argnums=2,
         )
-        self._chunks = (
-            None
-            if config.chunks is None
-            else ChunkDenoiser(config, cast(CausalDenoiser, networks.dit), mesh)
-        )
-        self._decode = CompiledFn(
+        self.decode = CompiledFn(
             lambda vae, x: to_uint8(vae.decode(x)),
             networks.vae,
             mesh=mesh,
             cache_key=("decode", config),
         )
+        vae = networks.vae
+        self.codec: CodecPrograms | None = None
+        self.denoiser: ChunkDenoiser | None = None
+        if isinstance(vae, CausalCodec):
+            self.codec = CodecPrograms(config, vae, mesh)
+        if config.chunks is not None:
+            if self.codec is None:
+                raise InputError(
+                    f"{config.name} makes clips chunk by chunk, but its {type(vae).__name__} codes "
+                    "only whole clips. (chunks, vae)"
+                )
+            self.denoiser = ChunkDenoiser(config, cast(CausalDenoiser, networks.dit), mesh)
 
     @property
     def point_px(self) -> int:
@@ -203,23 +210,40 @@ class Generator:
             apply(networks.dit, read_lora(lora, config.dit), scale=lora_scale)
         return cls(config.at(folder), networks, mesh, renderer=renderer)
 
-    def programs(self, batch: int) -> Iterator[tuple[str, CompiledFn, tuple]]:
-        """Yield name, function and input shapes of each function that `generate` calls."""
-        arrays = batch_shapes(batch, self.config)
-        yield "encode", self._encode, (arrays,)
+    @property
+    def chunk_frames(self) -> tuple[int, ...]:
+        """Frames of each chunk of a clip; a model that makes clips at once has one chunk."""
+        return self.config.chunk_frames
+
+    def programs(
+        self, batch: int, *, streamed: bool = False
+    ) -> Iterator[tuple[str, CompiledFn, tuple]]:
+        """Yield name, function and input shapes of each function that `generate` calls.
+
+        `streamed` yields the functions of `groups`; a causal student always streams.
+        """
+        config, codec = self.config, self.codec
+        whole = self.denoiser is None
+        arrays = batch_shapes(batch, config) if whole else clip_shapes(batch, config)
+        yield "encode", self.encode, (arrays,)
+        if codec is not None and not whole:
+            yield from codec.encode_programs(batch)
         seeds = jax.ShapeDtypeStruct((batch,), np.uint32)
         yield "noise", self._noise, (seeds,)
         noise = self._noise.shapes(seeds)
-        inputs = self._encode.shapes(arrays), noise, *self._step_seeds(seeds)
-        if self._chunks is None:
-            yield "denoise", self._denoise, inputs
+        condition, own = self.encode.shapes(arrays), self._step_seeds(seeds)
+        if self.denoiser is None:
+            yield "denoise", self._denoise, (condition, noise, *own)
         else:
-            yield from self._chunks.programs(*inputs)
-        yield "decode", self._decode, (noise,)
+            yield from self.denoiser.programs(condition.text, condition.image, noise, *own)
+        if codec is not None and (streamed or not whole):
+            yield from codec.decode_programs(batch)
+        else:
+            yield "decode", self.decode, (noise,)
 
-    def compile(self, batch: int) -> None:
-        """Compile all functions of `generate` for batches of this size."""
-        for _, program, inputs in self.programs(batch):
+    def compile(self, batch: int, *, streamed: bool = False) -> None:
+        """Compile all functions of `generate`, or of `groups`, for batches of this size."""
+        for _, program, inputs in self.programs(batch, streamed=streamed):
             program.compile(*inputs)
 
     def generate(
@@ -235,7 +259,10 @@ class Generator:
         `InputError` if a mesh does not divide the batch, and `NonFiniteError` naming the clips
         whose latents are not finite.
         """
-        return self._clips(self.latents(triplets, seeds, without=without))
+        if self.denoiser is None:
+            return self._clips(fetch(self.decode(self.latents(triplets, seeds, without=without))))
+        groups = list(self.groups(triplets, seeds, without=without))
+        return self._clips(np.concatenate(groups, axis=1))
 
     def latents(
         self,
@@ -245,31 +272,52 @@ class Generator:
         without: ConditionName | None = None,
     ) -> Float[Array, "b f h w z"]:
         """Return the latents that `generate` decodes; raises the same errors."""
-        condition = self._encode(pack(triplets, self.config, seeds))
-        if without is not None:
-            condition = condition.drop(without)
-        if self.config.chunks is None:
+        if self.denoiser is None:
+            condition = self.encode(pack(triplets, self.config, seeds))
+            if without is not None:
+                condition = condition.drop(without)
             step_seeds = self._step_seeds(last_32_bits(seeds))
             latents = self._denoise(condition, self.noise(seeds), *step_seeds)
         else:
-            latents = jnp.concatenate(list(self.chunks(condition, seeds)), axis=1)
+            clips = ClipStream(self, seeds, without)
+            found = [clips.denoise(part) for part in self._split(triplets)]
+            latents = jnp.concatenate(found, axis=1)
         bad = [n for n, latent in enumerate(fetch(latents)) if not np.isfinite(latent).all()]
         if bad:
             raise NonFiniteError([triplet.video_id for triplet in triplets], bad)
         return latents
 
-    def chunks(
-        self, condition: Condition, seeds: Sequence[int]
-    ) -> Iterator[Float[Array, "b f h w z"]]:
-        """Yield the latents of a causal student's chunks, without waiting for them.
+    def groups(
+        self,
+        triplets: Sequence[Triplet],
+        seeds: Sequence[int],
+        *,
+        without: ConditionName | None = None,
+    ) -> Iterator[UInt8[np.ndarray, "b g h w 3"]]:
+        """Yield the frames of one clip for each triplet in groups, as they are decoded.
 
-        Raises `InputError` for a model that makes clips at once.
+        A group is one frame, then four for each latent frame; all frames if the VAE is not causal.
+        Raises the errors of `generate`.
         """
-        bounds, noise = chunks_of(self.config).bounds, self.noise(seeds)
-        channels = self.config.layout.condition_channels(condition, noise)
-        parts = (channels[:, start:end] for start, end in pairwise(bounds))
-        given = condition.text, condition.image, parts, noise, last_32_bits(seeds)
-        yield from cast(ChunkDenoiser, self._chunks).latents(*given)
+        clips = ClipStream(self, seeds, without)
+        for number, part in enumerate(self._split(triplets)):
+            clips.put(part)  # before the frames of the chunk before are fetched
+            if number:
+                yield from clips.take()
+        yield from clips.take()
+
+    def begin(self, first_frame: UInt8[np.ndarray, "h w 3"], seed: int) -> ViewStream:
+        """Begin a clip of a simulation (`simulator.ChunkedGenerator`)."""
+        check_seed(seed, name="seed")
+        return ViewStream(self, first_frame, seed)
+
+    def stream(
+        self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
+    ) -> Iterator[UInt8[np.ndarray, "g h w 3"]]:
+        """Yield the frames of one clip of a simulation in groups, as they are decoded."""
+        check_seed(seed, name="seed")
+        for frames in self.groups([self.condition(view, action, first_frame)], [seed]):
+            yield frames[0]
 
     def __call__(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
@@ -282,9 +330,14 @@ class Generator:
         return self.generate([self.condition(view, action, first_frame)], [seed])[0].frames
 
     def condition(
-        self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"]
+        self,
+        view: View,
+        action: Action,
+        first_frame: UInt8[np.ndarray, "h w 3"],
+        *,
+        chunk: int | None = None,
     ) -> Triplet:
-        """Return the conditions of one clip of a simulation.
+        """Return the conditions of one clip of a simulation, or of a chunk of it by index.
 
         Raises `InputError` unless view, action and first frame have the length and size of the
         model's clips, and for a model of static videos and hand meshes.
@@ -296,13 +349,15 @@ class Generator:
                 "triplets (egosim generate --metadata), or simulate with an EgoSim model."
             )
         video = self.config.video
-        shape = (video.frames, video.height, video.width)
+        frames = video.frames if chunk is None else self.chunk_frames[chunk]
+        shape = (frames, video.height, video.width)
         check_video("The view", view.frames, shape)
         check_video("The first frame (a video of one frame)", first_frame[None], (1, *shape[1:]))
-        if len(action.joints_m) != video.frames:
+        if len(action.joints_m) != frames:
+            whole = "clips" if chunk is None else f"chunks {chunk + 1}"
             raise InputError(
-                f"The action has {len(action.joints_m)} frames, the clips of {self.config.name} "
-                f"have {video.frames}: give cameras and hands for {video.frames} frames."
+                f"The action has {len(action.joints_m)} frames, the {whole} of {self.config.name} "
+                f"have {frames}: give cameras and hands for {frames} frames."
             )
         return Triplet(
             video_id="clip",
@@ -315,6 +370,10 @@ class Generator:
 
     def fingerprint(self) -> str:
         """Return the content hash of the config and all weights in memory."""
+        return self._fingerprint
+
+    @cached_property
+    def _fingerprint(self) -> str:
         state = nnx.to_flat_state(nnx.state(self.networks, nnx.Param))
         return fingerprint(
             {
@@ -325,7 +384,7 @@ class Generator:
 
     def reconstruct(self, triplets: Sequence[Triplet]) -> list[Clip]:
         """Encode and decode the targets: an upper bound for any denoiser."""
-        return self._clips(self._latents(targets_of(triplets)))
+        return self._clips(fetch(self.decode(self._latents(targets_of(triplets)))))
 
     def noise(self, seeds: Sequence[int]) -> Float[Array, "b f h w z"]:
         """Return the initial noise of each seed; only its last 32 bits matter."""
@@ -335,8 +394,12 @@ class Generator:
         """Return the seeds as last argument of `denoise`; nothing if the solver adds no noise."""
         return (seeds,) if self.config.solver.stochastic else ()
 
-    def _clips(self, latents: Float[Array, "b f h w z"]) -> list[Clip]:
-        frames = fetch(self._decode(latents))
+    def _split(self, triplets: Sequence[Triplet]) -> Iterator[list[Triplet]]:
+        """Yield the conditions of each chunk of clips."""
+        parts = [split_triplet(triplet, self.chunk_frames) for triplet in triplets]
+        yield from map(list, zip(*parts, strict=True))
+
+    def _clips(self, frames: UInt8[np.ndarray, "b f h w 3"]) -> list[Clip]:
         return [Clip(frames=video, fps=self.config.video.fps) for video in frames]
 
 

@@ -58,7 +58,10 @@ def cached_compile(key: Any, args: Any, compile_fn: Callable[[], Any]) -> Any:
     name = _digest((key, sources), args)
     if (data := cache.get(name)) is not None:
         try:
-            return serialize_executable.deserialize_and_load(*pickle.loads(data))  # noqa: S301
+            return serialize_executable.deserialize_and_load(
+                *pickle.loads(data),  # noqa: S301
+                execution_devices=_devices(args),
+            )
         except Exception as error:  # whatever is wrong with it, it can be compiled again
             warnings.warn(f"{name} cannot be used and is compiled again: {error}", stacklevel=2)
     with _without_jax_cache():
@@ -124,6 +127,20 @@ def _digest(key: Any, args: Any) -> str:
 def _sharding(leaf: Any) -> str:
     sharding = getattr(leaf, "sharding", None)
     return "" if sharding is None else f"{sharding} {getattr(sharding, 'mesh', '')}"
+
+
+def _devices(args: Any) -> list[Any]:
+    """Return the devices of a mesh in its order, or the only one that has arguments.
+
+    By default, jax would load a function of one device for all devices of the machine.
+    """
+    shardings = [getattr(leaf, "sharding", None) for leaf in jax.tree.leaves(args)]
+    for sharding in shardings:
+        if isinstance(sharding, jax.sharding.NamedSharding):
+            mesh: Any = sharding.mesh
+            return list(mesh.devices.flat)
+    used = {device for s in shardings if s is not None for device in s.device_set}
+    return list(used) or jax.devices()[:1]
 
 
 @functools.cache

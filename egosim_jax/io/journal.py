@@ -86,8 +86,9 @@ class Journal:
         make: Callable[[], T],
         save: Callable[[Path, T], None],
         load: Callable[[Path], T],
+        about: Callable[[], Mapping[str, Any]] = dict,
     ) -> T:
-        """Run a phase, or load its recorded result.
+        """Run a phase, or load its recorded result; `about` returns more to record.
 
         A new result is saved, recorded and loaded back, so that an interrupted and an
         uninterrupted run continue from the same bytes. Raises `InputError` if the file of a
@@ -109,6 +110,7 @@ class Journal:
                 "file": str(output.relative_to(self._folder)),
                 "sha256": digest(output),
                 "seconds": round(time.monotonic() - then, 3),
+                **about(),
             }
         )
         return load(output)

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from flax import nnx
     from jax.sharding import Mesh
 
+STUDENT = "student.safetensors"
+"""Name of the LoRA in a weights folder that makes its denoiser a causal student."""
 CHUNKS = "chunks"
 """Metadata of a denoiser that is a causal student: the latent frames of its chunks."""
 MAX_LISTED = 12
@@ -111,17 +113,20 @@ def fill(
     nnx.update(module, state)
 
 
-def hashes(folder: Path, *, only: Collection[str] | None = None) -> dict[str, str]:
+def hashes(
+    folder: Path, *, only: Collection[str] | None = None, student: bool = False
+) -> dict[str, str]:
     """Return a hash per network in a weights folder, or per network in `only`.
 
-    Bit-equal weights have the same hash (`weights_hash`).
+    Bit-equal weights have the same hash (`weights_hash`). A student in the folder of its teacher
+    counts only with `student`: what the teacher alone makes does not depend on it.
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a weights folder. (--weights)")
     files = [
         path
         for path in sorted(folder.glob("[!.]*.safetensors"))  # hidden files are incomplete
-        if only is None or path.stem in only
+        if (path.stem in only if only is not None else student or path.name != STUDENT)
     ]
     return {path.stem: read_weights_hash(path) for path in files}
 
@@ -225,6 +230,21 @@ def _read(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise _absent(path)
     return read_safetensors(path)
+
+
+def student_of(file: Path, metadata: Mapping[str, str]) -> Path | None:
+    """Return the LoRA next to a denoiser's file that makes it the wanted causal student, or None.
+
+    `metadata` is the wanted student's. Raises `InputError` unless the file itself or the LoRA makes
+    the wanted chunks.
+    """
+    wanted, student = metadata.get(CHUNKS), file.with_name(STUDENT)
+    if wanted is None or read_metadata(file).get(CHUNKS) == wanted or not student.is_file():
+        check_chunks(file, wanted)
+        return None
+    check_chunks(file, None)  # the base makes clips at once
+    check_chunks(student, wanted)
+    return student
 
 
 def check_chunks(file: Path, wanted: str | None) -> None:

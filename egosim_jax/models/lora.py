@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
@@ -21,9 +22,9 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Float
 
-from egosim_jax.io.bounded import listing
-from egosim_jax.io.mapped import OURS
-from egosim_jax.io.weights import flat_shapes
+from egosim_jax.io.bounded import listing, quote_path, quote_text
+from egosim_jax.io.mapped import OURS, read_metadata, read_safetensors
+from egosim_jax.io.weights import WeightsError, flat_shapes, mismatches
 from egosim_jax.models.layers import Linear, LowRank, LowRankParam
 from egosim_jax.types import InputError
 
@@ -99,6 +100,30 @@ def apply(network: Any, changes: Mapping[str, Change], *, scale: float = 1.0) ->
             layers[path].low_rank = LowRank(down, scaled)
 
 
+def merge(network: Any, path: Path, *, base: str) -> None:
+    """Add the low-rank changes of one of our files to the weights of a network, in place.
+
+    Raises `InputError` if the file names base weights of another hash, or does not fit.
+    """
+    if (own := read_metadata(path).get(BASE)) != base:
+        raise InputError(
+            f"{quote_path(path)} is a LoRA of weights with the hash {quote_text(str(own)[:12])}, "
+            f"but those next to it have {base[:12]}. Give the weights that it was trained on. "
+            "(--weights)"
+        )
+    tensors = {name: tensor.array() for name, tensor in read_safetensors(path).items()}
+    changes = from_tensors(tensors)
+    check(flat_shapes(network), changes)
+    full = {}
+    for name, change in changes.items():
+        if isinstance(change, Delta):
+            low = (np.asarray(array, np.float32) for array in (change.down, change.up))
+            full[f"{name}.kernel"] = np.matmul(*low)
+        else:
+            full[name] = change
+    apply(network, full)
+
+
 def deltas_of(network: Any) -> dict[str, Delta]:
     """Return the low-rank changes of a network by the path of their layer."""
     return {
@@ -160,6 +185,26 @@ def pairs(tensors: Mapping[str, T]) -> dict[str, tuple[T, T]]:
 def metadata(config: str, *, base: str) -> dict[str, str]:
     """Return the metadata of a file; `base` is the hash of the weights that it was trained on."""
     return {"format": OURS, "config": config, BASE: base}
+
+
+def state_of(path: Path, abstract: nnx.State) -> nnx.State:
+    """Return the low-rank weights of networks from a file of the denoiser's LoRA.
+
+    Raises `InputError` unless the file has exactly the low-rank weights of `abstract`.
+    """
+    leaves = [item for item in nnx.to_flat_state(abstract) if isinstance(item[1], LowRankParam)]
+    # A path in a file has no names of the network and of the layer's low-rank part.
+    wanted = {".".join(map(str, (*path[1:-2], path[-1]))): (path, leaf) for path, leaf in leaves}
+    tensors = read_safetensors(path)
+    shapes = {name: tuple(leaf.shape) for name, (_, leaf) in wanted.items()}
+    if problems := mismatches(tensors, shapes):
+        raise WeightsError(problems, source=str(path))
+    return nnx.from_flat_state(
+        [
+            (where, leaf.replace(jnp.asarray(tensors[name].array(), jnp.float32)))
+            for name, (where, leaf) in wanted.items()
+        ]
+    )
 
 
 def start(

@@ -4,7 +4,7 @@ Cameras and hand joints are the generator's inputs. The stages then run in this 
 
     HandMasks          draws hands and arms from the joints
     TrackObjects       finds the motion of a held object that best explains the clip's colors
-    MovedObjects       sets the depth of the object where it moved
+    MovedObjects       sets the ids of the object where it moved
     NewSurfaces        continues planes of the state where it has no points
 
 Depth is set only where the clip differs from the view of the previous state. Elsewhere depth is
@@ -27,7 +27,6 @@ from egosim_jax.geometry import cameras_in_object_frame
 from egosim_jax.perception.new_surfaces import NewSurfaces
 from egosim_jax.perception.object_motion import TrackObjects
 from egosim_jax.perception.pipeline import Observation, Pipeline
-from egosim_jax.perception.pose_refinement import ColorCost
 from egosim_jax.perception.registry import register
 from egosim_jax.perception.silhouettes import HandShape, hand_silhouette
 from egosim_jax.rendering.reference import splat
@@ -55,16 +54,14 @@ class HandMasks(HandShape):
 
 @dataclass(frozen=True, kw_only=True)
 class MovedObjects:
-    """Stage that sets depth and ids of moved objects."""
+    """Stage that sets the ids of moved objects.
+
+    Their depth stays unknown. Their points move with them, and a point that is as large as a pixel
+    would make them thicker with each clip.
+    """
 
     point_px: int = 2
     """Size of the state's rendered points, in pixels."""
-    max_residual: float = 40.0
-    """Maximum color difference from the moved object where its depth is set, in 8-bit levels.
-
-    A clip may leave the object where it was, or draw a wider hand."""
-    color: ColorCost = field(default_factory=ColorCost)
-    """Comparison of colors."""
 
     def __post_init__(self) -> None:
         """Check that points have a size."""
@@ -73,10 +70,7 @@ class MovedObjects:
     def __call__(
         self, clip: Clip, action: Action, state: SceneState, so_far: Observation
     ) -> Observation:
-        """Set `object_ids` of moved objects, and `depth_m` where the clip shows them.
-
-        `depth_m` is infinite elsewhere.
-        """
+        """Set `object_ids` of moved objects, and no depth yet."""
         cameras, hand_ids, motions = (
             so_far.require(field, "MovedObjects") for field in ("cameras", "object_ids", "motions")
         )
@@ -86,18 +80,12 @@ class MovedObjects:
         rest = state.points_m[~np.isin(state.object_ids, list(motions))]
         nearest, _ = splat(rest, cameras, point_px=self.point_px)
         for number, motion in motions.items():
-            own = state.object_ids == number
-            points, colors = state.points_m[own].astype(float), state.colors[own]
+            points = state.points_m[state.object_ids == number].astype(float)
             local = cameras_in_object_frame(cameras, motion)
             moved, index = splat(points, local, point_px=self.point_px)
             nearer = (index >= 0) & (moved < nearest) & (hand_ids >= 0)
             nearest[nearer] = moved[nearer]
             ids[nearer] = number
-            frames, expected = (
-                x.astype(np.float32) for x in (clip.frames[nearer], colors[index[nearer]])
-            )
-            shown = self.color.apart(frames, expected) <= self.max_residual
-            depth[nearer] = np.where(shown, moved[nearer], np.inf)
         return replace(so_far, depth_m=depth, object_ids=ids)
 
 

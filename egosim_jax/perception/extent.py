@@ -1,4 +1,4 @@
-"""Choice between growths of a moved object by the whole scene that each one predicts.
+"""Choice between growths of a moved object, and its ends, by the whole scene that each predicts.
 
 A growth with half the object leaves the other half behind, and one with a part of the table takes
 it along. Both look wrong where the object was and where it went. So all growths are compared over
@@ -21,6 +21,8 @@ from egosim_jax.types import Cameras, SceneState
 
 FRAMES = 5
 """Number of compared frames, from the grasp to the end."""
+END_FRAMES = 3
+"""The same for motions of one object with different ends, which differ most in the last frames."""
 SMALLER = 0.1
 """Exponent of a part's relative size in the factor on its cost."""
 WITHOUT_EDGES = 1.2
@@ -37,6 +39,8 @@ SMOOTHED, SMOOTHINGS = 12, 4
 """Number of nearest points that decide together whether they move, and number of rounds."""
 AT_REST = 5.0
 """Minimum advantage of a resting point over a moving one, in 8-bit levels."""
+OTHER_END_M = 0.01
+"""Minimum mean distance of an object's points between two places that it may end at, in meters."""
 SQUARE = np.ones((3, 3), np.uint8)
 """A pixel and its neighbors."""
 
@@ -71,6 +75,45 @@ def choose_extent(
     edged = [any(motion.model is growth for growth in growths) for motion in motions]
     factors = (len(growths[0].points_m) / sizes) ** SMALLER * np.where(edged, 1.0, WITHOUT_EDGES)
     return int(np.argmin((costs + NOISE) * factors))
+
+
+def with_other_ends(ranked: Sequence[Candidate], count: int) -> list[Candidate]:
+    """Return the first candidates that leave the object in different places, up to a count."""
+    kept: list[Candidate] = []
+    ends: list[Float[np.ndarray, "n 3"]] = []
+    for change, motion in ranked:
+        end = transform(motion.path[-1], motion.model.points_m)
+        if all(np.linalg.norm(end - other, axis=1).mean() > OTHER_END_M for other in ends):
+            kept.append((change, motion))
+            ends.append(end)
+        if len(kept) == count:
+            break
+    return kept
+
+
+def best_of(
+    found: Sequence[Sequence[Candidate]],
+    cameras: Cameras,
+    state: SceneState,
+    shown: Float32[np.ndarray, "f h w 3"],
+    hidden: Bool[np.ndarray, "f h w"],
+    color: ColorCost,
+) -> Candidate | None:
+    """Return the best candidate of the object whose first one is the best; None if none moved.
+
+    An object's candidates are ranked by its own points. These cost little where the table covers
+    them, and on a pattern that repeats. So the whole scene decides between the ends.
+    """
+    moved = [ranked for ranked in found if ranked]
+    if not moved:
+        return None
+    best = min(moved, key=lambda ranked: ranked[0][0])
+    if len(best) == 1:
+        return best[0]
+    motions = [motion for _, motion in best]
+    scene = cameras, state, shown, hidden, color
+    costs = predicted_costs(motions, motions[0].model, *scene, count=END_FRAMES)
+    return best[0 if costs is None else int(np.argmin(costs))]
 
 
 def moving_part(
@@ -134,23 +177,27 @@ def predicted_costs(
     shown: Float32[np.ndarray, "f h w 3"],
     hidden: Bool[np.ndarray, "f h w"],
     color: ColorCost,
+    *,
+    count: int = FRAMES,
 ) -> Float[np.ndarray, " m"] | None:
     """Return how far the scene that each motion predicts is from the clip, in 8-bit levels.
 
-    The support is behind the `whole` cluster. Behind a part of it nothing is known, so these pixels
-    are not compared. If too few are left, the result is None.
+    `count` frames are compared. The support is behind the `whole` cluster. Behind a part of it
+    nothing is known, so these pixels are not compared. If too few are left, the result is None.
     """
     import cv2
 
-    frames = _compared_frames(motions)
+    frames = _compared_frames(motions, count)
     local = replace(cameras, world_from_camera=cameras.world_from_camera[frames])
     shown, hidden = shown[frames], hidden[frames]
     near = _near(motions, state)
     points, colors = state.points_m[near], state.colors[near].astype(np.float32)
     ground = _ground_color(motions[0], points, colors)
-    layers = [_draw(motion, frames, local, points) for motion in motions]
+    models = {id(motion.model): motion.model for motion in motions}
+    rests = {key: _draw_rest(model, local, points) for key, model in models.items()}
+    layers = [(*_draw(motion, frames, local), *rests[id(motion.model)]) for motion in motions]
     compared = np.any([layer[1] >= 0 for layer in layers], axis=0)
-    everything = np.concatenate([m.model.points_m for m in motions]).astype(np.float32)
+    everything = np.concatenate([m.points_m for m in models.values()]).astype(np.float32)
     compared |= splat(everything, local, point_px=POINT_PX)[1] >= 0
     covered = compared & ~hidden
     compared = covered.copy()
@@ -185,10 +232,10 @@ def _closest(
     return np.clip(shown, low, high)
 
 
-def _compared_frames(motions: Sequence[ObjectMotion]) -> Int[np.ndarray, " g"]:
+def _compared_frames(motions: Sequence[ObjectMotion], count: int = FRAMES) -> Int[np.ndarray, " g"]:
     first = min(motion.grasped for motion in motions)
     last = len(motions[0].path) - 1
-    return np.unique(np.rint(np.linspace(first, last, FRAMES + 1)[1:]).astype(int))
+    return np.unique(np.rint(np.linspace(first, last, count + 1)[1:]).astype(int))
 
 
 def _near(motions: Sequence[ObjectMotion], state: SceneState) -> Bool[np.ndarray, " n"]:
@@ -216,15 +263,17 @@ def _ground_color(
 
 
 def _draw(
-    motion: ObjectMotion,
-    frames: Int[np.ndarray, " g"],
-    cameras: Cameras,
-    points_m: Float32[np.ndarray, "n 3"],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return depth and index of the moved object, and of the points that it leaves behind."""
-    model = motion.model
+    motion: ObjectMotion, frames: Int[np.ndarray, " g"], cameras: Cameras
+) -> tuple[Float32[np.ndarray, "g h w"], Int[np.ndarray, "g h w"]]:
+    """Return depth and index of the moved object."""
     local = cameras_in_object_frame(cameras, motion.path[frames])
-    moved_m, moved = splat(model.points_m, local, point_px=POINT_PX)
+    return splat(motion.model.points_m, local, point_px=POINT_PX)
+
+
+def _draw_rest(
+    model: ObjectModel, cameras: Cameras, points_m: Float32[np.ndarray, "n 3"]
+) -> tuple[Float32[np.ndarray, "g h w"], Int[np.ndarray, "g h w"]]:
+    """Return depth and index of the points that an object leaves behind."""
     left = np.flatnonzero(~is_among(points_m, model.points_m.astype(np.float32)))
     rest_m, rest = splat(points_m[left], cameras, point_px=POINT_PX)
-    return moved_m, moved, rest_m, np.append(left, len(points_m))[rest]
+    return rest_m, np.append(left, len(points_m))[rest]

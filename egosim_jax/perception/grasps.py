@@ -16,7 +16,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float, Int
 
-from egosim_jax.geometry import hinge_rotation, umeyama
+from egosim_jax.geometry import hinge_rotation, transform, umeyama
 from egosim_jax.perception.silhouettes import PALM
 from egosim_jax.types import Kind
 
@@ -38,6 +38,8 @@ MIN_ARC_DEG = 25.0
 """Minimum angle of an arc, in degrees; a shorter arc does not determine its axis."""
 MAX_ARC_ERROR = 0.05
 """Maximum distance of the fingertips from an arc, as a fraction of its radius."""
+EDGE_M = 0.03
+"""Maximum distance of a lid's or door's points from its hinge, in meters."""
 FIRM_TOUCH_M = 0.015
 """Maximum distance of fingertips inside or outside the surface of an object that they hold."""
 FIRM_TRAVEL_M = 0.03
@@ -275,6 +277,17 @@ def hinge_motion(
     center = middle + x * across + y * along
     motion = np.stack([hinge_rotation(axis, center, float(a)) for a in angles - angles[0]])
     return motion[np.clip(np.arange(len(tips_m)), grasped, released) - grasped]
+
+
+def is_along_edge(points_m: Float[np.ndarray, "n 3"], hinged: Float[np.ndarray, "f 4 4"]) -> bool:
+    """Return True if the axis of a `hinge_motion` passes along an object that has these points.
+
+    A point of a motion by an angle a, at a distance r from the axis, moves by 2 r sin(a / 2).
+    """
+    turned = hinged[-1][:3, :3]
+    chord = np.sqrt(max(3.0 - float(np.trace(turned)), 0.0))  # 2 sin(a / 2)
+    moved = np.linalg.norm(transform(hinged[-1], points_m) - points_m, axis=1)
+    return bool(moved.min() <= EDGE_M * chord)
 
 
 def _twist(

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from egosim_jax.geometry import UP_AXES, up_of
+from egosim_jax.geometry import upward
 from egosim_jax.perception.grasps import Grip, from_grip
 from egosim_jax.perception.pose_refinement import ObjectModel
 from egosim_jax.state.planes import support_planes
@@ -80,14 +80,13 @@ class Surroundings:
         cls,
         state: SceneState,
         chosen: Int[np.ndarray, " k"],
-        eye_m: Float[np.ndarray, " 3"],
+        world_from_camera: Float[np.ndarray, "4 4"],
         config: Growth,
     ) -> Surroundings:
         """Return the surroundings of a hand from the chosen points of a state."""
         points, colors = state.points_m[chosen], state.colors[chosen].astype(np.float32)
-        up = np.array(UP_AXES[up_of(state)])
-        looks_down = up_of(state) == "-y"  # the first camera's own axis, far from the vertical
-        surfaces = support_planes(points, up, eye_m=eye_m if looks_down else None)
+        up, eye_m = upward(state, world_from_camera)
+        surfaces = support_planes(points, up, eye_m=eye_m)
         plane = surfaces[0].plane if surfaces else np.array([*up, np.nan])
         heights = points @ plane[:3] + plane[3]
         near = np.abs(heights)
@@ -102,7 +101,7 @@ class Surroundings:
             noise_m=noise,
             low_colors=colors[low],
             plane=plane,
-            eye_m=eye_m,
+            eye_m=world_from_camera[:3, 3],
             config=config,
         )
 
@@ -257,26 +256,31 @@ class Surroundings:
     def with_seam(
         self, members: Bool[np.ndarray, " n"], whole: Bool[np.ndarray, " n"]
     ) -> Bool[np.ndarray, " n"]:
-        """Return an object's points with those at its border whose color it has.
+        """Return an object's points, with each point at its border on the side of its color.
 
         At a concave edge to another object, the shape does not say which points are on which side.
         """
         from scipy.spatial import KDTree
 
-        (outside,) = np.nonzero(whole & ~members)
-        close = self._is_next_to(outside, members)
-        seam, rest = outside[close], outside[~close]
-        if not len(seam) or len(rest) < SEAM_COLORS:
+        outside = whole & ~members
+        at_border = np.zeros_like(members)
+        for side, beyond in ((outside, members), (members & self.hollow, outside)):
+            if side.any() and beyond.any():
+                at_border[side] = self._is_next_to(np.flatnonzero(side), beyond)
+        seam, own, rest = (
+            np.flatnonzero(part) for part in (at_border, members & ~at_border, outside & ~at_border)
+        )
+        if not len(seam) or min(len(own), len(rest)) < SEAM_COLORS:
             return members
 
         def difference(others: Int[np.ndarray, " m"]) -> Float[np.ndarray, " s"]:
             nearest = KDTree(self.points_m[others]).query(self.points_m[seam], SEAM_COLORS)[1]
-            colors, own = self.colors[others][nearest], self.colors[seam][:, None]
-            light = (own * colors).sum(axis=2) / np.maximum((colors**2).sum(axis=2), 1)
-            return np.linalg.norm(own - light[..., None] * colors, axis=2).min(axis=1)
+            colors, shown = self.colors[others][nearest], self.colors[seam][:, None]
+            light = (shown * colors).sum(axis=2) / np.maximum((colors**2).sum(axis=2), 1)
+            return np.linalg.norm(shown - light[..., None] * colors, axis=2).min(axis=1)
 
         grown = members.copy()
-        grown[seam] = difference(np.flatnonzero(members)) < difference(rest)
+        grown[seam] = difference(own) < difference(rest)
         return grown
 
     def model(self, members: Bool[np.ndarray, " n"]) -> ObjectModel:
@@ -364,7 +368,7 @@ def clusters_without_id(
     free = free[np.min(gaps, axis=0) <= config.max_extent_m]
     if len(free) < config.min_points:
         return [], "closed on nothing" if grip.sure else ""
-    around = Surroundings.of(state, free, cameras.world_from_camera[0, :3, 3], config)
+    around = Surroundings.of(state, free, cameras.world_from_camera[0], config)
     clusters, note = around.touched([grip.tips_m[frame] for frame in grip.grasps])
     return clusters, note if grip.sure else ""
 

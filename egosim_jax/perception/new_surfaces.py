@@ -3,13 +3,14 @@
 A pixel that no point of the state explains may continue a plane of the background: the table next
 to its observed part, the table under an object that moved away, or the floor. It does if its ray
 meets the plane near observed points of the plane, and its color is one of theirs. A table ends at
-its edge, and the frames show where: beyond it the colors are other ones. Other sides of a moved
-object are inside its convex hull. Everything else stays unknown.
+its edge, and the frames show where: beyond it the colors are other ones, or closer to another
+surface. Other sides of a moved object are inside its convex hull. Everything else stays
+unknown.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -54,12 +55,21 @@ class NewSurfaces:
     """Border around a moved object in which its other sides may be, as a fraction of the width."""
     side_reach_m: float = 0.03
     """Maximum distance of other sides from the object's observed points, in meters."""
+    bin: int = 12
+    """Size of the bins of the colors of other surfaces, in 8-bit levels."""
+    min_wall: int = 40
+    """Minimum number of points of a wall, of `plane_points`."""
+    min_bin: int = 5
+    """Minimum number of points of a bin."""
     color: ColorCost = field(default_factory=partial(ColorCost, min_light=0.7, max_light=1.15))
     """Comparison of colors."""
 
     def __post_init__(self) -> None:
         """Check that the counts are positive."""
-        names = ("max_frames", "max_planes", "min_points", "plane_points", "compared_points")
+        names = (
+            "max_frames", "max_planes", "min_points", "plane_points", "compared_points", "bin",
+            "min_bin", "min_wall",
+        )  # fmt: skip
         check_counts({name: getattr(self, name) for name in names})
 
     def __call__(
@@ -95,9 +105,10 @@ class NewSurfaces:
         """Return depth and object ids with new surfaces."""
         rest = ~np.isin(state.object_ids, list(motions))
         known_m, index = close_gaps(*splat(state.points_m[rest], add_margin(cameras), point_px=1))
-        new = (index < 0) & ~np.isfinite(depth) & ~dilate(ids < 0, self.margin)
+        new = (index < 0) & (ids == 0) & ~np.isfinite(depth) & ~dilate(ids < 0, self.margin)
         pixels = _Pixels.of(new, frames, cameras, self)
         planes = self._planes(state, rest, list(supports.values()))
+        pixels.compete(self._other_colors(state, planes))
         apart = ~dilate(ids > 0, self.margin)
         for plane in planes:
             pixels.offer(plane, apart)
@@ -116,6 +127,19 @@ class NewSurfaces:
             seam = dilate(continued, 0.0) & flush
             depth[seam] = there[seam]
         return depth, ids
+
+    def _other_colors(
+        self, state: SceneState, planes: Sequence[_Plane]
+    ) -> Float32[np.ndarray, "n 3"]:
+        """Return the colors, in bins, of background points that are on none of the planes."""
+        points = state.points_m[state.object_ids == 0]
+        away = np.full(len(points), np.inf)
+        for plane in planes:
+            away = np.minimum(away, np.abs(points @ plane.plane[:3] + plane.plane[3]))
+        colors = state.colors[state.object_ids == 0][away > 2 * self.tolerance_m]
+        bins, counts = np.unique(colors // self.bin, axis=0, return_counts=True)
+        bins = bins[counts >= self.min_bin]
+        return (bins.astype(np.float32) + 0.5) * self.bin
 
     def _planes(
         self,
@@ -137,7 +161,26 @@ class NewSurfaces:
                 break
             planes.append(_Plane(plane=plane, **_points_of(state, some[inliers])))
             some = np.delete(some, inliers)
+        if planes and len(some) >= self.min_wall:
+            wall, inliers = self._wall(state.points_m[some], planes[0].plane[:3])
+            if len(inliers) >= self.min_wall:
+                planes.append(_Plane(plane=wall, **_points_of(state, some[inliers])))
         return [plane for plane in planes if len(plane.points_m) >= self.compared_points]
+
+    def _wall(
+        self, points_m: Float32[np.ndarray, "n 3"], up: Float[np.ndarray, " 3"]
+    ) -> tuple[Float[np.ndarray, " 4"], Int[np.ndarray, " k"]]:
+        """Return the plane along `up` with the most inliers, and the inliers.
+
+        The frames show a strip of a wall, which does not determine a plane of any direction. Copies
+        of the points, far above them, make it one along `up`.
+        """
+        copies = np.concatenate([points_m, points_m + self.max_depth_m * up])
+        plane, _ = fit_plane(copies, self.tolerance_m)
+        plane = plane / np.linalg.norm(plane[:3])
+        inliers = np.flatnonzero(np.abs(points_m @ plane[:3] + plane[3]) <= self.tolerance_m)
+        upright = abs(float(plane[:3] @ up)) < 0.02
+        return plane, inliers if upright else inliers[:0]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,6 +294,16 @@ class _Pixels:
             object_ids=np.zeros(len(frame), np.int32),
             config=config,
         )
+
+    def compete(self, colors: Float32[np.ndarray, "n 3"]) -> None:
+        """Limit the color difference from a surface to that from the nearest of other colors.
+
+        A wall behind a table may look like the table in another light, but it looks more like the
+        wall.
+        """
+        for color in colors:
+            apart = self.config.color.apart(self.shown, color[None])
+            np.minimum(self.residual, apart, out=self.residual)
 
     def offer(self, surface: _Plane | _Hull, where: Bool[np.ndarray, "f h w"]) -> None:
         """Take a surface in the pixels `where` it is near its points and has a better color."""

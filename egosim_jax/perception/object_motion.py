@@ -3,10 +3,12 @@
 A grasped object moves with the hand. A candidate combines an object near a fingertip, two frames
 of a possible hold, and a motion of the hand that the object may follow (`grasps`). Its cost is the
 mean difference between the object's colors and the clip's colors where the object would be visible.
-The candidate that most improves on the object at rest is accepted. An object between the closing
-fingertips counts as moved unless the clip clearly shows it at rest. If they hold nothing with an
-id, candidates are grown from the points between them (`growth`), and `extent` chooses how far. A
-released object falls (`fall`) or is put down (`snap`), and `pose_refinement` refines its last pose.
+The candidate that most improves on the object at rest is accepted. If the time of the release is
+unknown, the whole scene that each end predicts decides between the best ends. An object between
+the closing fingertips counts as moved unless the clip clearly shows it at rest. If they hold
+nothing with an id, candidates are grown from the points between them (`growth`), and `extent`
+chooses how far. A released object falls or is put down (`falling`), and `pose_refinement` refines
+its last pose.
 """
 
 from __future__ import annotations
@@ -17,9 +19,23 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from egosim_jax.geometry import UP_AXES, Up, invert, pixels_of, transform, up_of
-from egosim_jax.perception.extent import Candidate, choose_extent, moving_part
-from egosim_jax.perception.grasps import MIN_HELD, Grip, couplings, is_firm, seen_frames
+from egosim_jax.geometry import invert, pixels_of, transform, upward
+from egosim_jax.perception.extent import (
+    Candidate,
+    best_of,
+    choose_extent,
+    moving_part,
+    with_other_ends,
+)
+from egosim_jax.perception.falling import fall, snap
+from egosim_jax.perception.grasps import (
+    MIN_HELD,
+    Grip,
+    couplings,
+    is_along_edge,
+    is_firm,
+    seen_frames,
+)
 from egosim_jax.perception.growth import NEW, Growth, clusters_without_id
 from egosim_jax.perception.hulls import hull_on_plane
 from egosim_jax.perception.pipeline import Observation
@@ -31,17 +47,9 @@ from egosim_jax.perception.pose_refinement import (
     refine_pose,
 )
 from egosim_jax.state.new_objects import next_object_id, with_objects
-from egosim_jax.state.planes import fit_plane
+from egosim_jax.state.planes import support_planes
 from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState, check_counts
-
-GRAVITY = 9.81
-"""Acceleration of a fall in m/s^2."""
-MIN_LIFT_M = 0.01
-"""Minimum height of a release above the first height, in meters; below it nothing falls."""
-FOOTPRINT_M = 0.006
-"""Horizontal distance within which the state's points are below an object, in meters."""
-SNAP_M = 0.02
-"""Maximum height error of a released object, above or below its support, in meters."""
+from egosim_jax.types.data import object_name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +60,8 @@ class TrackObjects:
     """Maximum distance from a fingertip to a candidate object, in meters."""
     opening_tolerance_m: float = 0.01
     """Maximum change of the distance between fingertips during a hold, in meters."""
+    ends: int = 8
+    """Maximum number of ends that are compared if the time of the release is unknown."""
     min_points: int = 30
     """Minimum number of points of an object, and of a surface around it."""
     compared_points: int = 150
@@ -91,7 +101,7 @@ class TrackObjects:
 
     def __post_init__(self) -> None:
         """Check that the numbers of points, the tolerance and the blur are positive."""
-        check_counts({"min_points": self.min_points, "compared_points": self.compared_points})
+        check_counts({n: getattr(self, n) for n in ("ends", "min_points", "compared_points")})
         for name in ("opening_tolerance_m", "blur_px"):
             if getattr(self, name) <= 0:
                 raise InputError(f"{name} must be positive, not {getattr(self, name)}.")
@@ -109,7 +119,7 @@ class TrackObjects:
         return replace(
             so_far,
             new_objects=new,
-            names={**(so_far.names or {}), **{number: f"object {number}" for number in new}},
+            names={**(so_far.names or {}), **{number: object_name(number, {}) for number in new}},
             notes=(*so_far.notes, *notes),
             motions={m.model.number: m.path for m in moved},
             support_planes={m.model.number: m.model.plane for m in moved},
@@ -184,39 +194,38 @@ def _best_candidate(
         tolerance_m=config.opening_tolerance_m,
         radius_m=config.grip_radius_m,
     )
-    found: list[Candidate] = []
+    scene = action.cameras, state, shown, hidden, config.color
+    found: list[list[Candidate]] = []
     held = False
     for number in _near_tips(grip.tips_m, state, config):
-        model = object_model(number, state, config)
+        model = object_model(number, state, config, action.cameras.world_from_camera[0])
         held |= any(grip.has(model.points_m, grasped) for grasped in grip.grasps)
         name = state.names.get(number, "").lower()
         prior = config.prompt_prior if name and name in action.prompt.lower() else 1.0
-        best = _best_motion(model, grip, prior, action.cameras, shown, hidden, config)
-        found += [best] if best else []
+        found.append(_best_motions(model, grip, prior, action.cameras, shown, hidden, config))
     if held:
-        return min(found, key=lambda candidate: candidate[0], default=None), ""
+        return best_of(found, *scene), ""
     clusters, note = clusters_without_id(grip, action.cameras, state, config.growth)
     for growths in clusters:
         tried = [
-            _best_motion(model, grip, 1.0, action.cameras, shown, hidden, config)
+            _best_motions(model, grip, 1.0, action.cameras, shown, hidden, config)
             for model in growths
         ]
-        moved = [best for best in tried if best is not None]
+        moved = [ranked for ranked in tried if ranked]
         if moved:
-            part = moving_part(moved[0][1], action.cameras, shown, hidden, config.color)
+            part = moving_part(moved[0][0][1], action.cameras, shown, hidden, config.color)
             if config.min_points <= len(part.points_m) < config.part * len(growths[0].points_m):
-                best = _best_motion(part, grip, 1.0, action.cameras, shown, hidden, config)
-                moved += [best] if best else []
-            scene = action.cameras, state, shown, hidden, config.color
-            found.append(moved[choose_extent(moved, growths, *scene)])
-    if found:
-        return min(found, key=lambda candidate: candidate[0]), ""
+                ranked = _best_motions(part, grip, 1.0, action.cameras, shown, hidden, config)
+                moved += [ranked] if ranked else []
+            found.append(moved[choose_extent([r[0] for r in moved], growths, *scene)])
+    if best := best_of(found, *scene):
+        return best, ""
     if clusters and grip.sure:
         note = "closed on something without an id that the clip shows at rest"
     return None, note
 
 
-def _best_motion(
+def _best_motions(
     model: ObjectModel,
     grip: Grip,
     prior: float,
@@ -224,13 +233,15 @@ def _best_motion(
     shown: Float32[np.ndarray, "f h w 3"],
     hidden: Bool[np.ndarray, "f h w"],
     config: TrackObjects,
-) -> Candidate | None:
-    """Return the best accepted motion of an object with one hand, after its change of cost.
+) -> list[Candidate]:
+    """Return the accepted motions of an object with one hand, after their change of cost.
 
     The change is relative to the object at rest, because an object in the table's color costs
     little anywhere. It is 0 if the object is not visible, and lower for an object in the grip.
+    The first motion has the lowest. If the opening does not say when the hand held the object, the
+    best ones with other ends follow.
     """
-    best: Candidate | None = None
+    accepted: list[Candidate] = []
     still = np.repeat(np.eye(4)[None], len(shown), axis=0)
     rest = _cost(model, still, cameras, shown, hidden, config)
     improvement = max(config.min_improvement, (1 - config.max_cost_ratio) * rest)
@@ -242,24 +253,25 @@ def _best_motion(
             max_change = config.firm_evidence
         loose = couplings(grip.palm_m, grip.rigid[hold[0]], model.plane[:3], hold)
         hinge = grip.hinges[hold]
+        if hinge is not None and is_along_edge(model.points_m, hinge):
+            loose = ()  # fingertips on an arc about an object's edge: a hand that carries has none
         for path in (*loose, hinge):
             if path is None:
                 continue
             cost = prior * _cost(model, path, cameras, shown, hidden, config)
             known = np.isfinite(cost) and np.isfinite(rest)
             change = (cost - rest if known else 0.0) - max_change
-            if change < (0.0 if best is None else best[0]):
-                best = (
-                    change,
-                    ObjectMotion(
-                        model=model,
-                        grasped=hold[0],
-                        released=hold[1],
-                        path=path,
-                        hinged=path is hinge,
-                    ),
+            if change < 0:
+                motion = ObjectMotion(
+                    model=model,
+                    grasped=hold[0],
+                    released=hold[1],
+                    path=path,
+                    hinged=path is hinge,
                 )
-    return best
+                accepted.append((change, motion))
+    accepted.sort(key=lambda candidate: candidate[0])
+    return accepted[:1] if grip.sure else with_other_ends(accepted, config.ends)
 
 
 def _near_tips(
@@ -278,7 +290,12 @@ def _near_tips(
     return near
 
 
-def object_model(number: int, state: SceneState, config: TrackObjects) -> ObjectModel:
+def object_model(
+    number: int,
+    state: SceneState,
+    config: TrackObjects,
+    world_from_camera: Float[np.ndarray, "4 4"],
+) -> ObjectModel:
     """Return the model of an object. Its plane is horizontal if no surface is around it."""
     own = state.object_ids == number
     points = state.points_m[own].astype(float)
@@ -286,7 +303,9 @@ def object_model(number: int, state: SceneState, config: TrackObjects) -> Object
         number=number,
         points_m=points,
         colors=state.colors[own].astype(np.float32),
-        plane=_support_plane(points, state.points_m[~own], config, up=up_of(state)),
+        plane=_support_plane(
+            points, state.points_m[~own], config, *upward(state, world_from_camera)
+        ),
     )
 
 
@@ -294,88 +313,25 @@ def _support_plane(
     points_m: Float[np.ndarray, "n 3"],
     others_m: Float32[np.ndarray, "m 3"],
     config: TrackObjects,
-    *,
-    up: Up = "z",
+    up: Float[np.ndarray, " 3"],
+    eye_m: Float[np.ndarray, " 3"] | None,
 ) -> Float[np.ndarray, " 4"]:
-    """Fit the plane (a, b, c, d) with the most inliers around an object (RANSAC).
+    """Fit the horizontal plane (a, b, c, d) with the most inliers around an object (RANSAC).
 
-    With too few points, return a horizontal plane of unknown height.
+    A box next to the object may have more points than the ground, so vertical planes are excluded.
+    Without a horizontal one, return a plane of unknown height. `up` and `eye_m` as in `upward`.
     """
     distances = np.linalg.norm(others_m - points_m.mean(axis=0), axis=1)
     near = others_m[distances < config.plane_radius_m]
-    if len(near) < config.min_points:
-        return np.array([*UP_AXES[up], np.nan])
-    return fit_plane(near, config.plane_tolerance_m)[0]
-
-
-def fall(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"], fps: int) -> ObjectMotion:
-    """Return the motion with a fall, after the release, to its first height above the ground.
-
-    `others_m` are the other points of the state. An object does not fall if it was not lifted, if
-    it is on a hinge, or if a hand holds it to the end.
-    """
-    if not motion.lands:
-        return motion
-    up, gap = _gap_below(motion, others_m)
-    first = motion.model.points_m
-    if ((transform(motion.path[motion.released], first) - first) @ up).mean() < MIN_LIFT_M:
-        return motion
-    seconds = np.maximum(np.arange(len(motion.path)) - motion.released, 0) / fps
-    drop = np.minimum(GRAVITY / 2 * seconds**2, max(gap, 0.0))
-    path = motion.path.copy()
-    path[:, :3, 3] -= drop[:, None] * up
-    return replace(motion, path=path)
-
-
-def snap(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"]) -> ObjectMotion:
-    """Return the motion with a released object at its first height above the surface below it.
-
-    The correction grows from the grasp to the release. Objects that do not `fall` are not snapped,
-    and none whose height differs by more than `SNAP_M`.
-    """
-    if not motion.lands:
-        return motion
-    up, gap = _gap_below(motion, others_m)
-    if abs(gap) > SNAP_M:
-        return motion
-    path = motion.path.copy()
-    path[:, :3, 3] -= motion.carried[:, None] * gap * up
-    return replace(motion, path=path)
-
-
-def _gap_below(
-    motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, " 3"], float]:
-    """Return the direction up, and how much higher above its support the object ends, in meters."""
-    normal, offset = motion.model.plane[:3], motion.model.plane[3]
-    first, end = motion.model.points_m, transform(motion.path[-1], motion.model.points_m)
-    side = 1.0 if first.mean(axis=0) @ normal + offset > 0 else -1.0
-    up, floor = side * normal, float(-side * offset)
-    # Not the clearance alone: only the visible side has points, so it is not 0 on the ground.
-    # Before the grasp, points above the object's lowest ones are next to it, or left of it.
-    under = others_m[others_m @ up < np.quantile(first @ up, 0.02) + FOOTPRINT_M]
-    return up, _clearance(end, others_m, up, floor) - _clearance(first, under, up, floor)
-
-
-def _clearance(
-    points_m: Float[np.ndarray, "n 3"],
-    others_m: Float32[np.ndarray, "m 3"],
-    up: Float[np.ndarray, " 3"],
-    floor: float,
-) -> float:
-    """Return the height of an object's lowest points above the highest surface below it."""
-    from scipy.spatial import KDTree
-
-    heights, others = points_m @ up, others_m @ up
-    level = np.eye(3) - np.outer(up, up)
-    below = (others > floor) & (others < heights.mean())
-    near, _ = KDTree(points_m @ level).query(
-        others_m[below] @ level, distance_upper_bound=FOOTPRINT_M
+    found = support_planes(
+        near,
+        up,
+        eye_m=eye_m,
+        tolerance_m=config.plane_tolerance_m,
+        min_points=config.min_points,
+        max_planes=1,
     )
-    support = others[below][np.isfinite(near)]
-    return float(
-        np.quantile(heights, 0.02) - (np.quantile(support, 0.95) if len(support) else floor)
-    )
+    return found[0].plane if found else np.array([*up, np.nan])
 
 
 def _cost(

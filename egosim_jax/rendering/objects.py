@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw
 
-from egosim_jax.types import View
+from egosim_jax.types import View, object_name
 
 TINT = 0.6
 """Weight of an object's color in a view."""
@@ -33,7 +33,7 @@ def draw_objects(view: View, names: Mapping[int, str]) -> UInt8[np.ndarray, "f h
         frames[own] = np.rint(tinted).astype(np.uint8)
     return np.stack(
         [
-            _write_names(frame, ids, {n: names.get(n, f"object {n}") for n in numbers})
+            _write_names(frame, ids, {n: object_name(n, names) for n in numbers})
             for frame, ids in zip(frames, view.object_ids, strict=True)
         ]
     )

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, no_type_check
 
@@ -15,7 +15,15 @@ from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.bounded import named, quote, read_json
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.state.depth import DEPTH_M
-from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, SceneState
+from egosim_jax.types import (
+    JOINTS,
+    Action,
+    Cameras,
+    InputError,
+    Kind,
+    SceneState,
+    near_view,
+)
 
 MAX_SPEED_M_S = 20.0
 """Maximum speed of the camera, in meters per second."""
@@ -195,6 +203,37 @@ def with_places(action: Action, placed_m: Float[np.ndarray, "f n j 3"]) -> Place
     """Return the action with the joints of all hands."""
     own = {field.name: getattr(action, field.name) for field in fields(Action)}
     return PlacedAction(**own, placed_m=placed_m)
+
+
+def slice_action(action: Action, start: int, end: int | None) -> Action:
+    """Return the action of some frames; a hand that is out of view in all of them is missing."""
+    poses = action.cameras.world_from_camera[start:end]
+    cameras, joints = replace(action.cameras, world_from_camera=poses), action.joints_m[start:end]
+    lost = np.logical_not(near_view(cameras, joints).any(axis=0))
+    joints = np.where(lost[None, :, None, None], np.nan, joints)
+    part = Action(cameras=cameras, joints_m=joints, kind=action.kind, prompt=action.prompt)
+    if isinstance(action, PlacedAction):
+        return with_places(part, action.placed_m[start:end])
+    return part
+
+
+def split_action(action: Action, lengths: Sequence[int]) -> list[Action]:
+    """Return the action of each chunk of a clip, by the numbers of frames of the chunks."""
+    if len(lengths) == 1:
+        return [action]
+    ends = np.cumsum(lengths).tolist()
+    return [slice_action(action, n - length, n) for length, n in zip(lengths, ends, strict=True)]
+
+
+def join_actions(first: Action, then: Action) -> Action:
+    """Return the action of consecutive frames."""
+    poses = [action.cameras.world_from_camera for action in (first, then)]
+    return Action(
+        cameras=replace(then.cameras, world_from_camera=np.concatenate(poses)),
+        joints_m=np.concatenate([first.joints_m, then.joints_m]),
+        kind=then.kind,
+        prompt=then.prompt,
+    )
 
 
 def save_placed(folder: Path, name: str, action: Action) -> None:

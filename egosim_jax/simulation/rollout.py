@@ -9,6 +9,7 @@ folder/clip_N/state/            state after the step
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sized
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +20,19 @@ from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.journal import Journal
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.perception import archive
-from egosim_jax.simulation.simulator import Simulator, Step
+from egosim_jax.rendering import POINT_PX, Renderer, reference
+from egosim_jax.simulation.simulator import (
+    ClipStream,
+    FrameTimer,
+    Latency,
+    Simulator,
+    Step,
+    VideoGenerator,
+    chunk_frames,
+)
 from egosim_jax.state import snapshot
 from egosim_jax.state.fuse import fuse
-from egosim_jax.types import Action, Clip, SceneState, check_seed
+from egosim_jax.types import Action, Clip, SceneState, View, check_seed
 
 OUTPUTS = ("clip_*/*",)
 """Globs of files that only a journaled simulation writes."""
@@ -74,6 +84,7 @@ class Rollout:
             "generator": fingerprint(simulator.generator),
             "renderer": fingerprint(simulator.renderer),
             "perception": fingerprint(simulator.perception),
+            "update_every": simulator.update_every,
             "fusion": fingerprint((simulator.fusion, simulator.point_px, simulator.fps)),
             "seed": str(seed),
         }
@@ -89,32 +100,104 @@ class Rollout:
     ) -> Step:
         """Run `Simulator.step` with each phase journaled."""
         simulator, folder = self.simulator, self.folder / f"clip_{number}"
+        timer, by_chunk = FrameTimer(simulator.show), simulator.update_every == "chunk"
+        timed, made = replace(simulator, show=timer), list[Step]()
         view = simulator.render(state, action)  # not journaled: it follows from state and action
+
+        def make() -> Clip:
+            if not by_chunk:
+                return timed.generate(view, action, seed=seed, first_frame=first_frame)
+            made.append(timed.step(state, action, seed=seed, first_frame=first_frame))
+            return made[0].clip
+
         clip = journal.phase(
             f"{number} generate",
             folder / "frames.npz",
-            make=lambda: simulator.generate(view, action, seed=seed, first_frame=first_frame),
+            make=make,
             save=_save_frames,
             load=lambda path: load_clip(path, simulator.fps),
+            about=lambda: asdict(timer.latency),
         )
-        perception = simulator.perception
-        if perception is None:
-            return Step(view=view, clip=clip, state=state)
-        perceived = journal.phase(
-            f"{number} perceive",
-            folder / "perceived.npz",
-            make=lambda: perception(clip, action, state),
-            save=archive.save,
-            load=archive.load,
-        )
+        recorded = journal.done[f"{number} generate"]
+        latency = Latency(**{field.name: recorded[field.name] for field in fields(Latency)})
+        if (perception := simulator.perception) is None:
+            return Step(view=view, clip=clip, state=state, latency=latency)
+        if by_chunk:
+            known = RecordedClip(generator=simulator.generator, frames=clip.frames)
+            replay = replace(simulator, show=None, generator=known)
+            step = made[0] if made else replay.step(state, action, seed=seed)
+            view, notes, make_state = step.view, step.notes, lambda: step.state
+        else:
+            perceived = journal.phase(
+                f"{number} perceive",
+                folder / "perceived.npz",
+                make=lambda: perception(clip, action, state),
+                save=archive.save,
+                load=archive.load,
+            )
+            notes = perceived.notes
+            make_state = lambda: fuse(state, perceived, fusion=simulator.fusion)  # noqa: E731
         after = journal.phase(
             f"{number} fuse",
             folder / "state",
-            make=lambda: fuse(state, perceived, fusion=simulator.fusion),
+            make=make_state,
             save=snapshot.save,
             load=snapshot.load,
         )
-        return Step(view=view, clip=clip, state=after, notes=perceived.notes)
+        return Step(view=view, clip=clip, state=after, notes=notes, latency=latency)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedClip:
+    """Generator of a clip that is known, in the chunks in which it was made."""
+
+    generator: VideoGenerator
+    """Generator that made the clip."""
+    frames: UInt8[np.ndarray, "f h w 3"]
+    """Frames of the clip."""
+
+    @property
+    def renderer(self) -> Renderer:
+        """Renderer of the generator."""
+        return getattr(self.generator, "renderer", reference)
+
+    @property
+    def point_px(self) -> int:
+        """Side of a point of the view in pixels."""
+        return getattr(self.generator, "point_px", POINT_PX)
+
+    @property
+    def chunk_frames(self) -> tuple[int, ...]:
+        """Frames of each chunk."""
+        return chunk_frames(self.generator) or (len(self.frames),)
+
+    def fingerprint(self) -> str:
+        """Return the content hash of the generator: the clip is its own."""
+        return fingerprint(self.generator)
+
+    def begin(self, first_frame: UInt8[np.ndarray, "h w 3"], seed: int) -> ClipStream:
+        """Begin the clip."""
+        ends = np.cumsum(self.chunk_frames)[:-1]
+        return _RecordedStream(iter(np.split(self.frames, ends)))
+
+    def __call__(
+        self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
+    ) -> UInt8[np.ndarray, "f h w 3"]:
+        """Return the frames."""
+        return self.frames
+
+
+@dataclass(frozen=True)
+class _RecordedStream:
+    """Chunks of a clip that is known (`simulator.ClipStream`)."""
+
+    chunks: Iterator[UInt8[np.ndarray, "f h w 3"]]
+
+    def put(self, view: View, action: Action) -> None:
+        pass
+
+    def take(self) -> Iterator[UInt8[np.ndarray, "g h w 3"]]:
+        yield next(self.chunks)
 
 
 def _save_frames(path: Path, clip: Clip) -> None:

@@ -36,7 +36,7 @@ class SupportPlane:
     plane: Float[np.ndarray, " 4"]
     """Plane (a, b, c, d); the unit normal points up."""
     inliers: Int[np.ndarray, " n"]
-    """Indices of the points on the surface."""
+    """Indices of the points on the surface, and on no larger one."""
 
     def heights(self, points_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Return the heights of points above the surface, in meters."""
@@ -67,6 +67,7 @@ def support_planes(
     eye_m: Float[np.ndarray, " 3"] | None = None,
     tolerance_m: float = 0.006,
     min_points: int = 30,
+    max_planes: int | None = None,
 ) -> list[SupportPlane]:
     """Return the horizontal surfaces of a scene, the largest first; the others are parallel to it.
 
@@ -80,7 +81,7 @@ def support_planes(
     upward = up / np.linalg.norm(up)
     max_angle = PARALLEL_DEG if eye_m is None else MAX_TILT_DEG
     for _ in range(MAX_FITS):
-        if len(rest) < max(min_points, 3):
+        if len(rest) < max(min_points, 3) or len(found) == max_planes:
             break
         plane, inliers = fit_plane(points_m[rest], tolerance_m)
         if len(inliers) < min_points:
@@ -93,10 +94,10 @@ def support_planes(
         if angle > max_angle or (found and area_of(points_m[on], plane) < MIN_AREA_M2):
             continue
         upward, max_angle = (plane[:3], PARALLEL_DEG) if not found else (upward, max_angle)
-        heights = points_m @ plane[:3] + plane[3]
-        found.append(
-            SupportPlane(plane=plane, inliers=np.flatnonzero(np.abs(heights) <= tolerance_m))
-        )
+        own = np.abs(points_m @ plane[:3] + plane[3]) <= tolerance_m
+        for larger in found:
+            own[larger.inliers] = False
+        found.append(SupportPlane(plane=plane, inliers=np.flatnonzero(own)))
     return found
 
 

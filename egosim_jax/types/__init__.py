@@ -37,6 +37,7 @@ from egosim_jax.types.data import (
     Triplet,
     View,
     near_view,
+    object_name,
 )
 from egosim_jax.types.settings import (
     WAN_GRID,
@@ -75,4 +76,5 @@ __all__ = [
     "check_video",
     "is_rigid",
     "near_view",
+    "object_name",
 ]

@@ -74,6 +74,11 @@ class SceneState:
             )
 
 
+def object_name(number: int, names: Mapping[int, str]) -> str:
+    """Return the name of an object, or its number if it has none."""
+    return names.get(number, f"object {number}")
+
+
 JOINTS: Mapping[Kind, int] = {"human": 21, "robot": 3}
 """Number of keypoints of a hand, by kind."""
 HAND_SIZE_M = (0.01, 1.0)

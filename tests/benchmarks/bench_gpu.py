@@ -4,6 +4,9 @@
     python -m tests.benchmarks.bench_gpu forward --layers 40 --kernels cudnn
     python -m tests.benchmarks.bench_gpu step --layers 18 --remats full attention
     python -m tests.benchmarks.bench_gpu clip
+    python -m tests.benchmarks.bench_gpu stream                      seconds of a student's chunk
+    python -m tests.benchmarks.bench_gpu stream --target h200:8      the same, predicted
+    python -m tests.benchmarks.bench_gpu stream --config debug --chunks 2 1  a trial on a CPU
 
 All of it at full width and with 24,960 tokens, on random weights. TFLOP/s and MFU count what the
 model needs (`forward_flops` of its config), without recomputation. `--profile` says where the
@@ -23,7 +26,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,18 +34,20 @@ import jax.numpy as jnp
 from flax import nnx
 
 from egosim_jax import configs
-from egosim_jax.configs.model import ModelConfig, Networks
+from egosim_jax.configs.model import ModelConfig
 from egosim_jax.generation.encoding import batch_shapes
-from egosim_jax.generation.generator import Generator
 from egosim_jax.models.attention import attention
 from egosim_jax.models.layers import init_sharded
 from egosim_jax.models.wan.dit import WanDiT
 from egosim_jax.preflight.report import compile_for
-from egosim_jax.preflight.targets import GIB, compile_offline, find, peak
+from egosim_jax.preflight.targets import GIB, compile_offline, find
 from egosim_jax.sharding import batch_sharding, make_mesh
 from egosim_jax.train import recipes
-from egosim_jax.train.update import Programs, Stage
+from egosim_jax.train.task import Stage
+from egosim_jax.train.update import Programs
 from egosim_jax.types import MeshConfig
+from tests.benchmarks.gpu import compile_all, draw, draw_generator, half, speed, taken, tera, timed
+from tests.benchmarks.gpu_stream import stream
 
 BFLOAT16 = 4e-3
 """Relative error that a kernel may have."""
@@ -55,13 +59,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("what", choices=["parts", "forward", "step", "clip"])
+    parser.add_argument("what", choices=["parts", "forward", "step", "clip", "stream"])
     parser.add_argument("--config", default="egosim_14b")
     parser.add_argument("--layers", type=int, help="fewer blocks than the model has")
     parser.add_argument("--kernels", nargs="+", default=["cudnn"])
     parser.add_argument("--remats", nargs="+", default=["full"])
     parser.add_argument("--clips", type=int, default=1)
-    parser.add_argument("--steps", type=int, default=50)
+    parser.add_argument("--steps", type=int, help="denoising steps: 50, or 2 for a student")
+    parser.add_argument("--chunks", type=int, nargs="+", default=[4, 4, 4, 4])
+    parser.add_argument("--first-steps", type=int, help="steps of the first chunk")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--profile", action="store_true")
     parser.add_argument("--target", help="only compile, for this: what the preflight predicts")
@@ -71,9 +77,8 @@ def main() -> None:
     else:
         device = jax.devices()[0]
         print(f"{device.device_kind}, jax {jax.__version__}", flush=True)
-    for line in {"parts": parts, "forward": forward, "step": step, "clip": clip}[options.what](
-        options
-    ):
+    measures = {"parts": parts, "forward": forward, "step": step, "clip": clip, "stream": stream}
+    for line in measures[options.what](options):
         print(json.dumps(line), flush=True)
 
 
@@ -87,7 +92,7 @@ def parts(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
         yield {
             "part": name,
             "ms": seconds * 1e3,
-            "tflops": _tera(2 * TOKENS * inner * outer, seconds),
+            "tflops": tera(2 * TOKENS * inner * outer, seconds),
         }
     q, k, v, g = (one(1, TOKENS, HEADS, WIDTH // HEADS) * (1 + i / 8) for i in range(4))
     flops = 4 * TOKENS**2 * WIDTH
@@ -103,7 +108,7 @@ def parts(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
         yield {
             "part": f"{kernel} forward",
             "ms": seconds * 1e3,
-            "tflops": _tera(flops, seconds),
+            "tflops": tera(flops, seconds),
             "error": float(error),
         }
 
@@ -114,7 +119,7 @@ def parts(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
         yield {
             "part": f"{kernel} forward and backward",
             "ms": both_s * 1e3,
-            "tflops backward": _tera(2.5 * flops, both_s - seconds),
+            "tflops backward": tera(2.5 * flops, both_s - seconds),
         }
     copied = _seconds(jax.jit(lambda x: x + 1), (jnp.tile(x, (8, 1, 1)),), options.repeats)
     yield {"part": "copy", "terabytes_s": 2 * 8 * x.nbytes / copied / 1e12}
@@ -140,7 +145,7 @@ def forward(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
             lambda p, *x, graph=graph: nnx.merge(graph, p)(*x), in_shardings=batch_sharding(mesh)
         )
         needed = options.clips * _forward_flops(config)
-        args = (_half(params), *shapes)
+        args = (half(params), *shapes)
         with jax.set_mesh(mesh):
             line = {"kernel": kernel, "layers": dit.layers}
             yield from _measure(options, run, args, needed, line)
@@ -169,35 +174,27 @@ def step(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 def clip(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """All of EgoSim-14B: conditions encoded, 50 steps, decoded, with all networks on the device."""
-    config = replace(configs.get(options.config), steps=options.steps)
-    shapes = Networks.abstract(config)
-    graph, params = nnx.split(shapes)
-    begun = time.perf_counter()
-    networks = nnx.merge(graph, _draw(_half(params)))
-    jax.block_until_ready(nnx.state(networks))
-    yield {"weights_s": time.perf_counter() - begun}
-    generator = Generator(config, networks)
-    programs: dict[str, Any] = {}
+    steps = options.steps or 50
+    config = replace(configs.get(options.config), steps=steps)
     line: dict[str, Any] = {}
-    for name, program, given in generator.programs(options.clips):
-        _timed(line, f"{name}_compile_s", lambda p=program, g=given: p.compile(*g) and None)
-        programs[name] = program
+    generator = draw_generator(config, line)
+    programs = {name: program for name, program, _ in compile_all(generator, options.clips, line)}
     yield line
-    inputs = _draw(batch_shapes(options.clips, config))
+    inputs = draw(batch_shapes(options.clips, config))
     seeds = jnp.arange(options.clips, dtype=jnp.uint32)
-    needed = options.clips * options.steps * _forward_flops(config)
+    needed = options.clips * steps * _forward_flops(config)
     for attempt in range(options.repeats):
-        line = {"clip": attempt, "steps": options.steps}
-        condition = _timed(line, "encode_s", lambda: programs["encode"](inputs))
-        noise = _timed(line, "noise_s", lambda: programs["noise"](seeds))
-        latents = _timed(line, "denoise_s", lambda c=condition, n=noise: programs["denoise"](c, n))
-        frames = _timed(line, "decode_s", lambda x=latents: programs["decode"](x))
+        line = {"clip": attempt, "steps": steps}
+        condition = timed(line, "encode_s", lambda: programs["encode"](inputs))
+        noise = timed(line, "noise_s", lambda: programs["noise"](seeds))
+        latents = timed(line, "denoise_s", lambda c=condition, n=noise: programs["denoise"](c, n))
+        frames = timed(line, "decode_s", lambda x=latents: programs["decode"](x))
         finite = bool(jnp.isfinite(latents).all()) and int(frames.max()) > int(frames.min())
         yield {
             **line,
-            "step_s": line["denoise_s"] / options.steps,
-            **_speed(needed, line["denoise_s"]),
-            "peak_gib": _taken(),
+            "step_s": line["denoise_s"] / steps,
+            **speed(needed, line["denoise_s"]),
+            "peak_gib": taken(),
             "finite": finite,
         }
     if options.profile:
@@ -238,10 +235,10 @@ def _measure(
         + memory.temp_size_in_bytes
     ) / GIB
     if make is None:
-        given = _draw(args)
+        given = draw(args)
         call = lambda: compiled(*given)  # noqa: E731
     else:
-        state, rest = [make()], _draw(args[1:])
+        state, rest = [make()], draw(args[1:])
 
         def call() -> Any:
             state[0], metrics = compiled(state[0], *rest)
@@ -259,8 +256,8 @@ def _measure(
         **line,
         "seconds": least,
         "spread": (max(seconds) - min(seconds)) / least,
-        **_speed(needed, least),
-        "peak_gib": _taken(),
+        **speed(needed, least),
+        "peak_gib": taken(),
         "finite": finite,
     }
     if options.profile:
@@ -294,40 +291,6 @@ def _forward_flops(config: ModelConfig) -> float:
     return config.dit.forward_flops(latents=latents, text=text, image=IMAGE).total
 
 
-def _half(params: Any) -> Any:
-    """The same shapes in bfloat16."""
-    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.bfloat16), params)
-
-
-def _draw(shapes: Any) -> Any:
-    """Random arrays of these shapes; zeros would be multiplied faster.
-
-    Weights have the scale of trained weights, and data have a deviation of 1: on smaller numbers a
-    GPU takes less power, and is faster.
-    """
-    paths, tree = jax.tree.flatten_with_path(shapes)
-    drawn = []
-    for seed, (path, leaf) in enumerate(paths):
-        name = jax.tree_util.keystr(path)
-        x = _random(seed, leaf.shape, leaf.dtype)
-        if "kernel" in name or "embedding" in name or "bias" in name or "modulation" in name:
-            x = x * jnp.asarray(0.02, x.dtype)
-        elif "scale" in name:
-            x = jnp.ones_like(x)
-        drawn.append(x)
-    return jax.tree.unflatten(tree, drawn)
-
-
-@partial(jax.jit, static_argnums=(1, 2))
-def _random(seed: int, shape: tuple[int, ...], dtype: Any) -> jax.Array:
-    key = jax.random.key(seed, impl="rbg")
-    if jnp.issubdtype(dtype, jnp.floating):
-        return jax.random.normal(key, shape, dtype)
-    if dtype == jnp.bool_:
-        return jnp.ones(shape, dtype)
-    return jax.random.randint(key, shape, 0, 256).astype(dtype)
-
-
 def _seconds(run: Callable[..., Any], args: tuple, repeats: int) -> float:
     """Median seconds of a call, among several that wait for each other on the device only."""
     jax.block_until_ready(run(*args))
@@ -339,27 +302,6 @@ def _seconds(run: Callable[..., Any], args: tuple, repeats: int) -> float:
         jax.block_until_ready(answer)
         found.append((time.perf_counter() - begun) / 4)
     return statistics.median(found)
-
-
-def _timed(line: dict[str, Any], name: str, run: Callable[[], Any]) -> Any:
-    begun = time.perf_counter()
-    answer = jax.block_until_ready(run())
-    line[name] = time.perf_counter() - begun
-    return answer
-
-
-def _tera(flops: float, seconds: float) -> float:
-    return flops / seconds / 1e12
-
-
-def _speed(flops: float, seconds: float) -> dict[str, float]:
-    rate = flops / seconds
-    return {"tflops": rate / 1e12, "mfu": rate / peak(jax.devices()[0].device_kind)}
-
-
-def _taken() -> float:
-    """GiB at the worst moment since the process began."""
-    return (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use", 0) / GIB
 
 
 @contextmanager

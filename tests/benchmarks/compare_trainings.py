@@ -41,8 +41,9 @@ from egosim_jax.io.weights import place
 from egosim_jax.sharding import batch_sharding, make_mesh
 from egosim_jax.train.loop import make_batches, validation_batches
 from egosim_jax.train.recipes import TABLETOP, TABLETOP_VAE
+from egosim_jax.train.task import Stage
 from egosim_jax.train.tasks.denoising import Denoising
-from egosim_jax.train.update import Programs, Stage, TrainState, mean_validation
+from egosim_jax.train.update import Programs, TrainState, mean_validation
 from egosim_jax.types import InputError
 from tests.benchmarks.critic import Adversarial
 from tests.benchmarks.routing import Routing

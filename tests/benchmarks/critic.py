@@ -19,8 +19,8 @@ from jaxtyping import Array, Float, Key
 
 from egosim_jax.conditioning.pixels import to_model
 from egosim_jax.configs.model import Networks
+from egosim_jax.train.task import Batch, Metrics
 from egosim_jax.train.tasks.refining import Refining
-from egosim_jax.train.update import Batch, Metrics
 
 WIDTHS = (32, 64, 128)
 """Channels of the critic's layers, each of half the size of the one before."""

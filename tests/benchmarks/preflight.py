@@ -28,7 +28,7 @@ from egosim_jax.preflight.targets import compile_offline, find
 from egosim_jax.sharding import make_mesh, parts
 from egosim_jax.train import recipes
 from egosim_jax.train.preflight import compile_step
-from egosim_jax.train.update import Stage
+from egosim_jax.train.task import Stage
 from egosim_jax.types import MeshConfig
 
 BEGIN, END = "<!-- python -m tests.benchmarks.preflight --write -->", "<!-- end -->"

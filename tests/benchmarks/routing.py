@@ -22,8 +22,8 @@ from egosim_jax.models.layers import scan_blocks
 from egosim_jax.models.wan.causal import whole
 from egosim_jax.models.wan.dit import DiTContext, WanDiT
 from egosim_jax.models.wan.layers import PATCH
+from egosim_jax.train.task import Metrics
 from egosim_jax.train.tasks.denoising import Denoising, condition_of, loss_weights
-from egosim_jax.train.update import Metrics
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,9 @@ import json
 
 import pytest
 
+from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
+from egosim_jax.io.weights import STUDENT
 from egosim_jax.worlds.tabletop.policies import POLICIES
 
 pytestmark = pytest.mark.slow
@@ -49,3 +51,34 @@ def test_policies_are_ranked_and_the_ranking_resumes(weights, tmp_path, capsys):
     next((out / "scenes").glob("*.json")).unlink()
     assert main(command) == 0
     assert (out / "report.json").read_bytes() == kept
+
+
+def test_a_student_is_compared_with_its_teacher_and_the_loop_resumes(tmp_path, capsys):
+    """A stage whose file is the student's own is the student."""
+    out, file = tmp_path / "out", configs.weights_of("tabletop_student", None) / STUDENT
+    command = ["experiment", "students", "--out", str(out), "--stages", f"own={file}"]
+    command += ["--scenes", "2", "--batch-size", "2", "--teacher-steps", "2"]
+    command += ["--sequences", "1", "--clips", "1"]
+    assert main(command) == 0
+    report = json.loads((out / "report.json").read_text("utf-8"))
+    rows = ["teacher, 2 steps", "teacher's weights, chunk by chunk"]
+    rows += [f"{rows[1]}, refreshed", "own", "own, refreshed", "student"]
+    assert list(report["table"]) == rows
+    assert report["table"]["own"] == report["table"]["student"]
+    assert report["table"]["own"] != report["table"]["own, refreshed"]
+    assert report["differences"]["own"]["psnr"]["mean"] == 0
+    assert report["loop"]["tables"]["teacher"] != report["loop"]["tables"]["student"]
+    assert (out / "contact_sheet.png").exists()
+    assert "the student's differences" in capsys.readouterr().out
+    kept = {path: path.stat().st_mtime_ns for path in out.glob("loop/*/*/scores.json")}
+    assert len(kept) == 2
+    assert main(command) == 0
+    assert json.loads((out / "report.json").read_text("utf-8")) == report
+    assert all(path.stat().st_mtime_ns == made for path, made in kept.items())
+
+
+def test_a_stage_without_a_file_is_refused_before_work(tmp_path, capsys):
+    command = ["experiment", "students", "--out", str(tmp_path / "out"), "--stages", "x=nowhere"]
+    assert main(command) == 2
+    assert "lora.safetensors" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -10,12 +10,15 @@ from pathlib import Path
 from egosim_jax import configs
 from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.io import weights
+from egosim_jax.models.chunks import Chunks
 from egosim_jax.runtime.command import ExitCode, run_with_exit_codes
 from egosim_jax.testing import tiny_model
-from egosim_jax.train.config import OptimizerConfig, TrainConfig
+from egosim_jax.train.config import CriticConfig, OptimizerConfig, TrainConfig
 from egosim_jax.train.distributed import training_context
 from egosim_jax.train.loop import train
+from egosim_jax.train.tasks.consistency import Consistency
 from egosim_jax.train.tasks.denoising import Denoising
+from egosim_jax.train.tasks.matching import Matching
 from egosim_jax.types import VideoSpec
 
 MODEL = tiny_model()
@@ -30,9 +33,14 @@ DWM = dataclasses.replace(
     posterior="sampled",
 )
 """A tiny `dwm_tabletop` with all random draws of DWM's training."""
+STUDENT = dataclasses.replace(MODEL, chunks=Chunks(sizes=(1, 1)), steps=2)
 TASKS = {
     "egosim": Denoising(model=MODEL, dropout=DROPOUT),
     "dwm": Denoising(model=DWM, dropout=DROPOUT, navigation=0.3),
+    "student_cd": Consistency(model=STUDENT, points=4),
+    "student_dmd": Matching(
+        model=STUDENT, training=CriticConfig(updates=2, optimizer=OptimizerConfig())
+    ),
 }
 
 

@@ -23,8 +23,8 @@ from egosim_jax.train.bundle_writer import write_bundle
 from egosim_jax.train.config import OptimizerConfig, TrainConfig
 from egosim_jax.train.loop import train
 from egosim_jax.train.recipes import TABLETOP
+from egosim_jax.train.task import Stage
 from egosim_jax.train.tasks.denoising import Denoising
-from egosim_jax.train.update import Stage
 from egosim_jax.types import InputError
 from tests.flags import QUICK
 from tests.training.killing import logged

@@ -12,7 +12,15 @@ from tests.training.run_tiny import TASKS, fit
 STEPS, SAVE_EVERY = 8, 3
 
 
-@pytest.mark.parametrize("task", ["egosim", pytest.param("dwm", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "task",
+    [
+        "egosim",
+        pytest.param("dwm", marks=pytest.mark.slow),
+        pytest.param("student_cd", marks=pytest.mark.slow),
+        pytest.param("student_dmd", marks=pytest.mark.slow),
+    ],
+)
 def test_a_killed_run_repeats_losses_and_weights_bit_for_bit(task, tmp_path, undrawn):
     latents, whole = tmp_path / "latents", tmp_path / "whole"
     write_latents(latents, TASKS[task].model)

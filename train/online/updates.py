@@ -20,10 +20,10 @@ from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.generation.generator import denoise
 from egosim_jax.train.config import OptimizerConfig, make_optimizer
 from egosim_jax.train.online.pool import Rows, as_floats
+from egosim_jax.train.task import Metrics
 from egosim_jax.train.tasks.autoencoding import psnr
 from egosim_jax.train.tasks.denoising import Denoising, condition_of
 from egosim_jax.train.tasks.refining import Refining, lpips
-from egosim_jax.train.update import Metrics
 
 
 @no_type_check

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Key
 
 from egosim_jax.conditioning.pixels import to_model
 from egosim_jax.models import VideoCodecConfig
-from egosim_jax.train.update import Batch, Metrics
+from egosim_jax.train.task import Batch, Metrics
 from egosim_jax.types import InputError, VideoSpec
 
 

@@ -25,8 +25,8 @@ from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.diffusion.objective import Objective
 from egosim_jax.diffusion.process import DenoiseFn
 from egosim_jax.generation.encoding import encode_condition
-from egosim_jax.models import CausalDenoiser, CausalDenoiserConfig, lora
-from egosim_jax.train.update import Batch, Metrics
+from egosim_jax.models import CausalDenoiser, CausalDenoiserConfig, Flops, lora
+from egosim_jax.train.task import Batch, Metrics
 from egosim_jax.types import InputError
 
 VALIDATION_SIGMAS = (0.2, 0.5, 0.8, 0.97)
@@ -75,8 +75,13 @@ class Denoising:
 
     @property
     def trained(self) -> Any:
-        """The nnx filter of the trained weights: all, or the LoRA."""
-        return nnx.Param if self.rank is None else lora.trained(self.model.dit.also_train)
+        """The nnx filter of the trained weights: all, or the LoRA.
+
+        A student keeps the text and image encoders of its teacher.
+        """
+        if self.rank is not None:
+            return lora.trained(self.model.dit.also_train)
+        return nnx.Param if self.model.chunks is None else _of_denoiser
 
     @property
     def frozen_dtype(self) -> str:
@@ -112,7 +117,7 @@ class Denoising:
         return jnp.stack([jax.random.split(drop, batch), jax.random.split(draw, batch)], axis=1)
 
     def loss(
-        self, networks: Networks, batch: Batch, keys: Key[Array, "b 2"]
+        self, networks: Any, batch: Batch, keys: Key[Array, "b 2"]
     ) -> tuple[jax.Array, Metrics]:
         """Return the diffusion loss of a batch under condition dropout."""
         if self.model.posterior == "sampled":
@@ -122,7 +127,7 @@ class Denoising:
         condition = condition_of(networks, batch, self.model)
         condition = self.dropout.apply(condition, keys[:, 0])
         process, target = self.model.process, batch["target"]
-        denoise = _denoise(self.model, networks, condition, target)
+        denoise = denoising(self.model, networks, condition, target)
         weights = loss_weights(target, batch.get("prior", target), self.change_loss_weight)
         chunks = self.model.chunks and self.model.chunks.sizes
         loss, _ = self.objective.loss(
@@ -137,7 +142,7 @@ class Denoising:
         """
         target = batch["target"]
         condition = condition_of(networks, batch, self.model)
-        denoise = _denoise(self.model, networks, condition, target)
+        denoise = denoising(self.model, networks, condition, target)
         keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), batch["record"])
         noise = jax.vmap(lambda key: jax.random.normal(key, target.shape[1:]))(keys)
         axes = 1 if self.model.chunks is None else 2  # a student's chunks have their own times
@@ -150,20 +155,36 @@ class Denoising:
 
     def flops(self, samples: int) -> float:
         """Return the model FLOPs of an update, of the denoiser alone, which has nearly all."""
+        return samples * self.with_gradient(self.forward())
+
+    def forward(self) -> Flops:
+        """Return the FLOPs of a forward pass of one sample; of a student, of packed chunks."""
+        if self.model.chunks is None:
+            return self.model.dit.forward_flops(**self.sizes)
+        dit = cast(CausalDenoiserConfig, self.model.dit)
+        return dit.packed_flops(**self.sizes, chunks=self.model.chunks)
+
+    def with_gradient(self, forward: Flops) -> float:
+        """Return the FLOPs of a forward pass with its gradients of activations and of weights.
+
+        The gradient of a LoRA's weights costs little.
+        """
+        return (3 if self.rank is None else 2) * forward.weights + 3 * forward.attention
+
+    @property
+    def sizes(self) -> dict[str, Any]:
+        """Latent cells of a clip, and its numbers of text and image tokens."""
         model = self.model
-        sizes = {
+        return {
             "latents": model.latent_shape,
             "text": model.tokenizer.max_tokens,
             "image": model.image_tokens,
         }
-        if model.chunks is None:
-            forward = model.dit.forward_flops(**sizes)
-        else:
-            dit = cast(CausalDenoiserConfig, model.dit)
-            forward = dit.packed_flops(**sizes, chunks=model.chunks)
-        # Forward, then gradients of activations and of weights; a LoRA's weights cost little.
-        weights = 3 if self.rank is None else 2
-        return samples * (weights * forward.weights + 3 * forward.attention)
+
+
+def _of_denoiser(path: tuple[Any, ...], value: Any) -> bool:
+    """Return whether a variable of the networks is a weight of the denoiser, as an nnx filter."""
+    return isinstance(value, nnx.Param) and path[0] == "dit"
 
 
 def draw_latents(batch: Batch, keys: Key[Array, " b"]) -> Batch:
@@ -208,9 +229,10 @@ def loss_weights(
     return weight / weight.mean(axis=(1, 2, 3), keepdims=True)
 
 
-def _denoise(
+def denoising(
     model: ModelConfig, networks: Networks, condition: Condition, latents: Float[Array, "b f h w c"]
 ) -> DenoiseFn:
+    """Return the denoising of clips: of a student, with clean `latents` before each chunk."""
     dit, chunks = networks.dit, model.chunks
     channels = model.layout.condition_channels(condition, latents)
     context = dit.prepare(channels, condition.text, condition.image)

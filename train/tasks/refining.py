@@ -29,8 +29,8 @@ from jaxtyping import Array, Float, Int, Key
 from egosim_jax.conditioning.pixels import to_model
 from egosim_jax.configs.model import Networks
 from egosim_jax.evaluation.metrics.lpips import Lpips
+from egosim_jax.train.task import Batch, Metrics
 from egosim_jax.train.tasks.autoencoding import Autoencoding
-from egosim_jax.train.update import Batch, Metrics
 from egosim_jax.types import InputError
 
 Part = Literal["all", "decoder"]

@@ -43,41 +43,45 @@ def load_backend(
     steps: int | None = None,
     batch: int = 1,
     compile: bool = True,
+    update_every: Literal["clip", "chunk"] = "clip",
 ) -> Backend:
     """Return the true tabletop world, or a model's world that batches up to `batch` clips.
 
     The model is compiled for all batch sizes now, over all devices. Without `compile` it is
-    compiled at the first step.
+    compiled at the first step. `update_every` updates the state after each clip or, with a causal
+    student, after each chunk of a clip.
     """
     from dataclasses import replace
 
     from egosim_jax import configs
     from egosim_jax.generation.generator import Generator
-    from egosim_jax.generation.stream import Streamer
     from egosim_jax.interactive.env.backends import GeneratedWorld
     from egosim_jax.interactive.env.batching import Batcher
     from egosim_jax.interactive.env.true_world import TrueWorld
     from egosim_jax.sharding import make_mesh, parts
+    from egosim_jax.simulation.simulator import check_update_every
     from egosim_jax.types import MeshConfig
 
     model = configs.get(config)
     model = replace(model, steps=steps or model.steps)
     if world == "true":
         return TrueWorld(video=model.video)
+    check_update_every(update_every, model.chunk_frames, model.name, perception)
     if world != "generated":
         raise InputError(f"There is no world {world!r:.40}: it must be 'generated' or 'true'.")
     mesh = make_mesh(MeshConfig(data=-1, fsdp=1))
     folder = configs.weights_of(config, None if weights is None else Path(weights))
-    generator = Streamer(Generator.load(model, folder, mesh=mesh))
+    generator = Generator.load(model, folder, mesh=mesh)
     unit = parts("batch", mesh)
     batcher = Batcher(generator, max_batch=max(batch, unit), unit=unit)
     for size in batcher.sizes if compile else ():
-        generator.compile(size)
+        generator.compile(size, streamed=True)
     return GeneratedWorld(
         generator=batcher,
         video=model.video,
         perception=perception,
         trained_on=configs.trained_on(config, folder),
+        update_every=update_every,
     )
 
 

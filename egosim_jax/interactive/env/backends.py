@@ -9,7 +9,12 @@ from typing import ClassVar, Protocol, runtime_checkable
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.perception import registry
-from egosim_jax.simulation.simulator import Simulator, VideoGenerator
+from egosim_jax.simulation.simulator import (
+    Simulator,
+    UpdateEvery,
+    VideoGenerator,
+    chunk_frames,
+)
 from egosim_jax.simulation.start import Start
 from egosim_jax.types import VideoSpec, check_seed
 from egosim_jax.worlds.tabletop import start_of_sequence
@@ -22,6 +27,11 @@ class Backend(Protocol):
     @property
     def video(self) -> VideoSpec:
         """Length, size and rate of the clips."""
+        ...
+
+    @property
+    def chunk_frames(self) -> tuple[int, ...]:
+        """Frames of each chunk of a clip; a world that makes clips at once has one chunk."""
         ...
 
     @property
@@ -58,7 +68,15 @@ class GeneratedWorld:
     trained_on: str | None = None
     """Simulated world whose clips trained the generator (`configs.trained_on`); None if unknown."""
 
+    update_every: UpdateEvery = "clip"
+    """Update of the state after each clip, or after each chunk of a clip."""
+
     needs_past: ClassVar[bool] = False
+
+    @property
+    def chunk_frames(self) -> tuple[int, ...]:
+        """Frames of each chunk of a clip."""
+        return chunk_frames(self.generator) or (self.video.frames,)
 
     def identity(self) -> dict[str, str]:
         """Return the size of the clips, the perception, and the generator's content hash."""
@@ -66,6 +84,7 @@ class GeneratedWorld:
             "world": "generated",
             "video": str(self.video),
             "perception": str(self.perception),
+            "update_every": self.update_every,
             "generator": fingerprint(self.generator),
         }
 
@@ -84,6 +103,7 @@ class GeneratedWorld:
             generator=self.generator,
             perception=None if pipeline is None else pipeline.build(),
             fps=self.video.fps,
+            update_every=self.update_every,
         )
 
 

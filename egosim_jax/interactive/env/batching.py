@@ -21,16 +21,20 @@ import numpy as np
 from jaxtyping import UInt8
 
 from egosim_jax.rendering import Renderer
-from egosim_jax.simulation.simulator import VideoGenerator
+from egosim_jax.simulation.simulator import ClipStream, VideoGenerator
 from egosim_jax.types import Action, InputError, Triplet, View, check_counts, check_seed
 
 
 @runtime_checkable
 class BatchGenerator(VideoGenerator, Protocol):
-    """Generator of several clips in one program (`generation.stream.Streamer`)."""
+    """Generator of several clips in one program (`generation.generator.Generator`)."""
 
     renderer: Renderer
-    point_px: int
+
+    @property
+    def point_px(self) -> int:
+        """Side of the points of a prior in pixels."""
+        ...
 
     def condition(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"]
@@ -46,6 +50,15 @@ class BatchGenerator(VideoGenerator, Protocol):
 
     def fingerprint(self) -> str:
         """Return the content hash of the config and weights."""
+        ...
+
+    @property
+    def chunk_frames(self) -> tuple[int, ...]:
+        """Frames of each chunk of a clip."""
+        ...
+
+    def begin(self, first_frame: UInt8[np.ndarray, "h w 3"], seed: int) -> ClipStream:
+        """Begin a clip whose conditions are given chunk by chunk."""
         ...
 
 
@@ -118,6 +131,15 @@ class Batcher:
     def fingerprint(self) -> str:
         """Return the generator's content hash; batching does not change a clip."""
         return self._fingerprint
+
+    @property
+    def chunk_frames(self) -> tuple[int, ...]:
+        """Frames of each chunk of a clip."""
+        return self._generator.chunk_frames
+
+    def begin(self, first_frame: UInt8[np.ndarray, "h w 3"], seed: int) -> ClipStream:
+        """Begin a clip whose conditions are given chunk by chunk; it is not batched."""
+        return self._generator.begin(first_frame, seed)
 
     @contextmanager
     def announced(self) -> Iterator[None]:

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.batching import announced
 from egosim_jax.simulation.actions import check_action
-from egosim_jax.simulation.simulator import Simulator, Step
+from egosim_jax.simulation.simulator import FrameTimer, Simulator, Step
 from egosim_jax.simulation.start import Start
 from egosim_jax.state import snapshot
 from egosim_jax.types import Action, Cameras, SceneState, VideoSpec, View
@@ -56,6 +56,26 @@ class Timing:
     """Generation of the clip, including the wait for its batch."""
     update_s: float = field(compare=False)
     """Perception of the clip and its fusion into the state."""
+    first_frame_s: float = field(compare=False)
+    """From the action to the first decoded frames."""
+    last_frame_s: float = field(compare=False)
+    """From the action to the last decoded frames."""
+
+    @classmethod
+    def of(cls, timer: FrameTimer, ended: float, rendered: float | None = None) -> Timing:
+        """Return the timing of a step by its frames, its end, and the end of its rendering.
+
+        Phases that alternate, chunk by chunk, count as generation.
+        """
+        first_s, last_s = timer.latency.first_frame_s, timer.latency.last_frame_s
+        render_s = 0.0 if rendered is None else rendered - timer.since
+        return cls(
+            render_s=render_s,
+            generate_s=last_s - render_s,
+            update_s=ended - timer.since - last_s,
+            first_frame_s=first_s,
+            last_frame_s=last_s,
+        )
 
 
 def make_chunk(
@@ -102,19 +122,19 @@ def timed_step(
     first_frame: np.ndarray | None,
 ) -> tuple[Step, Timing]:
     """Run one step of a simulator, and time its phases."""
-    then = time.monotonic()
+    timer = FrameTimer(simulator.show)
+    shown = replace(simulator, show=timer)
     with announced(simulator.generator):  # before rendering, so that a batch waits for this clip
-        view = simulator.render(state, action)
+        if simulator.update_every == "chunk":
+            step = shown.step(state, action, seed=seed, first_frame=first_frame)
+            return step, Timing.of(timer, time.monotonic())
+        view = shown.render(state, action)
         rendered = time.monotonic()
-        clip = simulator.generate(view, action, seed=seed, first_frame=first_frame)
-    generated = time.monotonic()
+        clip = shown.generate(view, action, seed=seed, first_frame=first_frame)
     after, notes = simulator.update(state, clip, action)
-    timing = Timing(
-        render_s=rendered - then,
-        generate_s=generated - rendered,
-        update_s=time.monotonic() - generated,
-    )
-    return Step(view=view, clip=clip, state=after, notes=notes), timing
+    timing = Timing.of(timer, time.monotonic(), rendered)
+    step = Step(view=view, clip=clip, state=after, notes=notes, latency=timer.latency)
+    return step, timing
 
 
 def state_info(state: SceneState) -> dict[str, Any]:

@@ -28,6 +28,7 @@ from egosim_jax.interactive.env.chunks import (
     timed_step,
     view_of,
 )
+from egosim_jax.interactive.env.parts import OpenStep, part_rows
 from egosim_jax.interactive.env.rewards import Outcome, RewardFn, check_reward, no_reward
 from egosim_jax.interactive.env.validity import validity
 from egosim_jax.io.bounded import quote
@@ -170,20 +171,28 @@ class RunningEpisode:
 
     def simulate(self, chunk: Chunk) -> tuple[Step, dict[str, Any]]:
         """Return the step of a chunk and its metadata, without changing the episode."""
-        now, action = self.now, chunk.action
-        simulator = self.backend.simulator(now)
+        now = self.now
         step, timing = timed_step(
-            simulator,
+            self.backend.simulator(now),
             now.state,
-            action,
+            chunk.action,
             seed=now.seed + now.steps + 1,
             first_frame=now.first_frame,
         )
-        return step, {
+        return step, {**self.facts(chunk, step), "timing": timing}
+
+    def open(self, prompt: str | None) -> OpenStep:
+        """Begin the next step, whose rows are given part by part."""
+        return OpenStep(self.backend, self.actions, self.now, prompt)
+
+    def facts(self, chunk: Chunk, step: Step) -> dict[str, Any]:
+        """Return the metadata of a step of a chunk."""
+        now = self.now
+        renderer = self.backend.simulator(now).renderer
+        return {
             **chunk.info(self.actions),
             "notes": list(step.notes),
-            **validity(now.state, step, action, simulator.renderer),
-            "timing": timing,
+            **validity(now.state, step, chunk.action, renderer),
         }
 
     def advance(self, chunk: Chunk, step: Step) -> dict[str, Any]:
@@ -249,12 +258,18 @@ class WorldEnv(gymnasium.Env):
         self.action_space = spaces.Box(low, high, dtype=np.float64)
         self.observation_space = observation_space(backend.video, self.actions, self._observe)
         self._running: RunningEpisode | None = None
+        self._open: OpenStep | None = None
         self._ended = self._closed = False
 
     @property
     def chunk(self) -> int:
         """Maximum number of rows of a chunk."""
         return self.backend.video.frames - 1
+
+    @property
+    def parts(self) -> tuple[int, ...]:
+        """Number of rows of each part of a clip, for `part_step`."""
+        return part_rows(self.backend.chunk_frames)
 
     @property
     def running(self) -> RunningEpisode:
@@ -274,6 +289,7 @@ class WorldEnv(gymnasium.Env):
         start = start_from_options(self.backend, self.actions, seed=chosen, options=options)
         check_reward(self._reward, start)
         self._running, self._ended = RunningEpisode(self.backend, self.actions, start), False
+        self._open = None
         return self.running.observation(self._observe), self.running.info()
 
     def step(
@@ -291,12 +307,54 @@ class WorldEnv(gymnasium.Env):
         `info` has the chunk number, padded frames, hidden hands, hash of the state, names and poses
         of the objects, seconds of each phase, `validity`, `object_validity` and `success`.
         """
+        running = self._continued()
+        chunk = running.chunk(actions, prompt=prompt)
+        self._open = None
+        return self._advance(chunk, *running.simulate(chunk))
+
+    def part_step(
+        self, actions: Float[np.ndarray, "k d"], *, prompt: str | None = None
+    ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Simulate the rows of the next part of a clip (`parts`), and hold the last row until then.
+
+        Before the last part, the reward is 0, the observed frames hold the last one, the state is
+        the clip's first, and `info` has the part and its latency. The first part's prompt counts.
+        """
+        running = self._continued()
+        if self._open is None:
+            self._open = running.open(prompt)
+        step = self._open
+        try:
+            step.step(actions)
+        except FloatingPointError:
+            self._open = None  # no part of this clip can follow
+            raise
+        about = {"part": step.done, "timing": step.latency}
+        if step.left:
+            found = running.observation(self._observe)
+            if "frames" in found:
+                missing = self.backend.video.frames - len(step.frames)
+                found["frames"] = np.pad(step.frames, ((0, missing), *[(0, 0)] * 3), mode="edge")
+            found["row"] = step.row.copy()
+            if "keypoints" in found:
+                found["keypoints"] = self.actions.joints(step.row[None])[0]
+            return found, 0.0, False, False, {**running.info(), **about}
+        self._open = None
+        chunk, made = step.finish()
+        return self._advance(chunk, made, {**running.facts(chunk, made), **about})
+
+    def _continued(self) -> RunningEpisode:
+        """Return the episode. Raises `InputError` if it has ended."""
         self._check_open()
-        running = self.running
         if self._ended:
             raise InputError("The episode has ended: reset it before the next step.")
-        chunk = running.chunk(actions, prompt=prompt)
-        step, known = running.simulate(chunk)
+        return self.running
+
+    def _advance(
+        self, chunk: Chunk, step: Step, known: dict[str, Any]
+    ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Move the episode past a step, and return its result."""
+        running = self.running
         result = self._reward(Outcome(first=running.start.state, step=step))
         info = {**running.advance(chunk, step), **known, "success": result.success}
         truncated = running.chunks >= self._max_chunks and not result.terminated

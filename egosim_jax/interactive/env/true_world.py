@@ -53,6 +53,11 @@ class TrueWorld:
     )
 
     @property
+    def chunk_frames(self) -> tuple[int, ...]:
+        """Return one chunk: this world makes clips at once."""
+        return (self.video.frames,)
+
+    @property
     def trained_on(self) -> None:
         """Return None: this world has no model."""
         return None

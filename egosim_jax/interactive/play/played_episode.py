@@ -13,7 +13,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import no_type_check
+from typing import cast, no_type_check
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -21,8 +21,16 @@ from jaxtyping import Float, UInt8
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import GeneratedWorld
 from egosim_jax.interactive.env.chunks import straight_path, view_of
-from egosim_jax.interactive.play.moves import Pose, ready_pose, scene_from_state, suggest_goal
-from egosim_jax.interactive.server.session import Session
+from egosim_jax.interactive.env.parts import part_rows
+from egosim_jax.interactive.play.moves import (
+    Pose,
+    drive,
+    ready_pose,
+    scene_from_state,
+    suggest_goal,
+)
+from egosim_jax.interactive.server.parts import PartResult, Parts
+from egosim_jax.interactive.server.session import Result, Session
 from egosim_jax.rendering.mesh import Side
 from egosim_jax.simulation.actions import places_of
 from egosim_jax.simulation.episode import Episode
@@ -85,6 +93,7 @@ class PlayedEpisode:
             row = ready_pose(self.scene, self.goal[0], side).row(side, np.zeros(6))
             start = replace(start, row=np.clip(row, *actions.bounds))
         self.session = Session.create(folder / name, world, actions, start)
+        self._parts = Parts(most=1, idle_s=0.0)
         self._filming = ThreadPoolExecutor(1, thread_name_prefix="truth")
         first = self.session.result.frames
         truth: Future[Filmed] | None = None
@@ -143,22 +152,67 @@ class PlayedEpisode:
         Moments after the current one are dropped. `show` gets each group of frames, and True with
         the last group, before perception starts. A hand out of view is hidden.
         """
+        rows = self._rows(poses, self.row, camera)
+        session = self.session
+        return self._make(lambda n, shown: session.step(n, rows, caption, shown), caption, show)
+
+    def steer(
+        self,
+        aim: Callable[[], tuple[Pose, Float[np.ndarray, " 6"]]],
+        caption: str,
+        show: Callable[[Frames, bool], None],
+    ) -> Timing:
+        """Make a clip in which the hand follows `aim`: the pose and camera where it should be.
+
+        A causal student asks for them again before each part of the clip, so the hand changes
+        course while the clip is made. `show` is used as in `step`.
+        """
+        counts = part_rows(self.world.chunk_frames)
+
+        def make(number: int, shown: Callable[[Frames], None]) -> Result:
+            row, target, planned = self.row, None, np.zeros((0, 0))
+            result: Result | PartResult | None = None
+            for part, count in enumerate(counts, start=1):
+                hand, camera = aim()
+                aimed = hand.row(self.side, camera)
+                if target is None or not np.allclose(aimed, target):
+                    poses = drive(Pose.of_row(row, self.side), hand, sum(counts[part - 1 :]) + 1)
+                    target, planned = aimed, self._rows(poses, row, camera)
+                rows, planned = planned[:count], planned[count:]
+                result = self._parts.step(self.session, number, part, rows, caption, shown)
+                row = result.row
+            return cast(Result, result)
+
+        return self._make(make, caption, show)
+
+    def _make(
+        self,
+        make: Callable[[int, Callable[[Frames], None]], Result],
+        caption: str,
+        show: Callable[[Frames, bool], None],
+    ) -> Timing:
+        """Make a clip, and append its moment; `make` gets the step's number and a callback."""
         then, times, count = time.monotonic(), [], 0
         number, before = self.session.committed + 1, self.now
-        rows = self._rows(poses, camera)
         truth: Future[Filmed] | None = None
 
-        def shown(frames: Frames) -> None:
-            nonlocal count, truth
-            count += len(frames)
-            last = count == self.world.video.frames
-            if last and before.truth is not None:  # renders while perception runs
+        def film() -> None:
+            nonlocal truth
+            if before.truth is not None and truth is None:
                 action = self.session.action(number)
                 truth = self._filming.submit(partial(_film, before.truth, action))
+
+        def shown(frames: Frames) -> None:
+            nonlocal count
+            count += len(frames)
+            last = count == self.world.video.frames
+            if last and self.session.pending:
+                film()  # renders while perception runs
             show(frames, last)
             times.append(time.monotonic() - then)
 
-        result = self.session.step(number, rows, caption, shown)
+        result = make(number, shown)
+        film()
         self.moments[self.at + 1 :] = [
             Moment(
                 start=self.session.now,
@@ -173,9 +227,13 @@ class PlayedEpisode:
         return Timing(first_s=times[0], last_s=times[-1], total_s=time.monotonic() - then)
 
     def _rows(
-        self, poses: Sequence[Pose], camera: Float[np.ndarray, " 6"]
+        self,
+        poses: Sequence[Pose],
+        row: Float[np.ndarray, " d"],
+        camera: Float[np.ndarray, " 6"],
     ) -> Float[np.ndarray, "k d"]:
-        cameras = straight_path(self.row[-6:], camera, len(poses) + 1)
+        """Return the rows of hand poses, in which the camera moves from a row to the given one."""
+        cameras = straight_path(row[-6:], camera, len(poses) + 1)
         rows = [pose.row(self.side, own) for pose, own in zip(poses, cameras, strict=True)]
         return np.clip(rows, *self.session.actions.bounds)
 

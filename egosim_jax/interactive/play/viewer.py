@@ -23,12 +23,11 @@ from egosim_jax.interactive.origins import is_local
 from egosim_jax.interactive.play.moves import (
     Interaction,
     Pose,
-    drive,
     intent_of,
     perform,
     pre_grasp_pose,
 )
-from egosim_jax.interactive.play.played_episode import Frames, Moment, PlayedEpisode
+from egosim_jax.interactive.play.played_episode import Frames, Moment, PlayedEpisode, Timing
 from egosim_jax.io.bounded import quote_text
 from egosim_jax.io.video import write_video
 from egosim_jax.types import InputError
@@ -230,10 +229,15 @@ class Page:
 
     def _drive(self) -> None:
         played = self.played
-        poses = drive(played.hand, self._hand, played.world.video.frames)
-        self._step(poses, played.now.start.prompt)
+        aim = lambda: (self._hand, self._camera)  # noqa: E731
+        caption = played.now.start.prompt
+        self._run(caption, lambda show: played.steer(aim, caption, show))
 
     def _step(self, poses: Sequence[Pose], caption: str) -> None:
+        self._run(caption, lambda show: self.played.step(poses, self._camera, caption, show))
+
+    def _run(self, caption: str, make: Callable[[Callable[[Frames, bool], None]], Timing]) -> None:
+        """Make a clip, and show its frames as they are decoded and its latency."""
         self._status.content = "Generating…"
 
         def show(frames: Frames, last: bool) -> None:
@@ -242,7 +246,7 @@ class Page:
             if last:
                 self._status.content = "Updating the state…"
 
-        timing = self.played.step(poses, self._camera, caption, show)
+        timing = make(show)
         self._status.content = (
             f"{quote_text(caption)}  \nFirst frame after {timing.first_s:.1f} s, last after "
             f"{timing.last_s:.1f} s; state updated after {timing.total_s:.1f} s."

@@ -4,6 +4,7 @@ with Client("ws://127.0.0.1:8000") as client:
     session = client.create(seed=3)
     reply = session.step(rows)  # {"frames": ..., "row": ..., "info": ...}
     reply = session.step(rows, show=lambda frames: ...)  # groups of decoded frames
+    reply = session.step_part(rows)  # frames of the next part: change course while a clip is made
 """
 
 from __future__ import annotations
@@ -131,6 +132,7 @@ class RemoteSession:
         """Reply to the request that created or attached the session."""
         self.step_id: int = reply["step_id"]
         """Number of the last committed step."""
+        self._part = 0
 
     def step(self, rows: np.ndarray, *, show: Show | None = None, **fields: Any) -> dict[str, Any]:
         """Make the next step, and return its reply.
@@ -138,6 +140,27 @@ class RemoteSession:
         `show` gets the frames in groups as they are decoded, before the step is perceived and
         committed. A step that is already committed or under way is not shown.
         """
+        reply = self._step(rows, show, fields)
+        self.step_id = reply["step_id"]
+        return reply
+
+    def step_part(
+        self, rows: np.ndarray, *, show: Show | None = None, **fields: Any
+    ) -> dict[str, Any]:
+        """Make the next part of the next step, and return its reply.
+
+        The server's description has the number of rows of each part (`part_rows`). The reply to the
+        last part is the step's. After an error the next call begins the step again.
+        """
+        part, self._part = self._part + 1, 0
+        reply = self._step(rows, show, {"part": part, **fields})
+        if "part" in reply:
+            self._part = part
+        else:
+            self.step_id = reply["step_id"]
+        return reply
+
+    def _step(self, rows: np.ndarray, show: Show | None, fields: dict[str, Any]) -> dict[str, Any]:
         fields = {"actions": np.asarray(rows, float), **fields}
         if show is not None:
             fields["stream"] = True
@@ -150,7 +173,6 @@ class RemoteSession:
                 f"{self.step_id + 1} of {self.id}: a client is for one thread. Use a client "
                 "per thread."
             )
-        self.step_id = reply["step_id"]
         return reply
 
     def reset(self, **fields: Any) -> dict[str, Any]:

@@ -7,13 +7,15 @@ from collections.abc import Mapping
 from numbers import Integral
 from typing import Any
 
+from egosim_jax.interactive.env.action_spec import to_numbers
 from egosim_jax.interactive.env.chunks import OBSERVATIONS
 from egosim_jax.io.bounded import quote
+from egosim_jax.io.digest import fingerprint
 from egosim_jax.types import InputError
 
 REQUESTS = {
     "create": ("session", "seed", "prompt", "episode", "actions", "observe"),
-    "step": ("session", "step_id", "actions", "prompt", "observe", "stream"),
+    "step": ("session", "step_id", "part", "actions", "prompt", "observe", "stream"),
     "reset": ("session", "seed", "prompt", "episode", "observe"),
     "save": ("session", "name"),
     "load": ("session", "name", "observe"),
@@ -80,6 +82,16 @@ def prompt_of(request: Mapping[str, Any]) -> str | None:
     return prompt
 
 
+def part_of(request: Mapping[str, Any]) -> int | None:
+    """Return the part of a step, from 1; None for a step whose rows are given at once."""
+    if request.get("part") is None:
+        return None
+    part = check_integer(request["part"], "part")
+    if part < 1:
+        raise InputError(f"part is {part}: it must be from 1 to the number of parts of a step.")
+    return part
+
+
 def check_name(name: object, field: str) -> str:
     """Return a name that is safe as a folder name. Raises `InputError` for any other."""
     if not isinstance(name, str) or not NAMES.fullmatch(name):
@@ -102,3 +114,11 @@ def check_mapping(value: object, field: str) -> Mapping[str, Any]:
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
         raise InputError(f"{field} is {quote(value)}: it must be a map from names to values.")
     return value
+
+
+def request_hash(rows: object, prompt: str | None, part: int | None = None) -> str:
+    """Return the hash that identifies a repeated step, or part of one.
+
+    Raises `InputError` for invalid rows.
+    """
+    return fingerprint((to_numbers(rows), prompt, *([] if part is None else [part])))

@@ -13,7 +13,7 @@ from dataclasses import asdict
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
@@ -21,7 +21,9 @@ from jaxtyping import UInt8
 from egosim_jax.interactive.env import World, load_backend
 from egosim_jax.interactive.env.action_spec import LAYOUTS
 from egosim_jax.interactive.env.chunks import OBSERVATIONS, STATE_FIELDS, view_of
+from egosim_jax.interactive.env.parts import part_rows
 from egosim_jax.interactive.server.errors import RequestError
+from egosim_jax.interactive.server.parts import PartResult
 from egosim_jax.interactive.server.requests import (
     REQUESTS,
     is_streamed,
@@ -32,6 +34,7 @@ from egosim_jax.interactive.server.session import Result, Session
 from egosim_jax.interactive.server.store import Limits, Store
 from egosim_jax.io.executables import share_with_jax
 from egosim_jax.runtime.memory import return_freed_blocks
+from egosim_jax.simulation.simulator import Latency
 from egosim_jax.types import InputError
 
 T = TypeVar("T")
@@ -67,6 +70,7 @@ class Service:
             "width": video.width,
             "fps": video.fps,
             "rows": video.frames - 1,
+            "part_rows": list(part_rows(self.store.backend.chunk_frames)),
             "layouts": list(LAYOUTS),
             "observations": list(OBSERVATIONS),
             "requests": {name: list(fields) for name, fields in REQUESTS.items()},
@@ -117,7 +121,7 @@ class Service:
             return {"session": await self._wait(store.remove(request)), "closed": True}
         run = {"step": store.step, "reset": store.reset, "load": store.load}[name]
         result = await self._wait(run(request))
-        if name == "step":
+        if name == "step" and not isinstance(result, PartResult):
             self.metrics.steps.inc()
         return await self._reply(session, result, observe)
 
@@ -152,7 +156,8 @@ class Service:
             result = await made
         finally:
             made.cancel()  # the client disconnected; this ends the wait, not the step
-        self.metrics.steps.inc()
+        if not isinstance(result, PartResult):
+            self.metrics.steps.inc()
         reply = await self._reply(session, result, observe)
         if times:
             self.metrics.first_frames.observe(times[0])
@@ -194,18 +199,20 @@ class Service:
             ) from None
 
     async def _reply(
-        self, session: Session, result: Result, observe: tuple[str, ...]
+        self, session: Session, result: Result | PartResult, observe: tuple[str, ...]
     ) -> dict[str, Any]:
         found: dict[str, Any] = {
             "session": session.id,
             "step_id": result.step_id,
             "row": result.row,
-            "info": dict(result.info),
         }
         if "frames" in observe:
             found["frames"] = result.frames
         if "keypoints" in observe:
             found["keypoints"] = session.actions.joints(result.row[None])[0]
+        if isinstance(result, PartResult):  # a part changes no state
+            return {**found, "part": result.part, "timing": _timing(result.latency)}
+        found["info"] = dict(result.info)
         if "state" in observe:
             found["state"] = {name: getattr(result.state, name) for name in STATE_FIELDS}
         if "depth" in observe:
@@ -214,6 +221,11 @@ class Service:
             view = await self._wait(self.store.submit(render, bounded=False))
             found["depth"] = np.asarray(view.depth_m[0])
         return found
+
+
+def _timing(latency: Latency) -> dict[str, float]:
+    """Return the latency of frames as the replies have it."""
+    return {"first_frames_s": latency.first_frame_s, "last_frames_s": latency.last_frame_s}
 
 
 def open_service(
@@ -226,12 +238,19 @@ def open_service(
     perception: str,
     steps: int | None,
     batch: int,
+    update_every: Literal["clip", "chunk"] = "clip",
 ) -> Service:
     """Load and compile a world, resume the sessions of a folder, and return the service."""
     share_with_jax()
     return_freed_blocks()
     backend = load_backend(
-        world, config=config, weights=weights, perception=perception, steps=steps, batch=batch
+        world,
+        config=config,
+        weights=weights,
+        perception=perception,
+        steps=steps,
+        batch=batch,
+        update_every=update_every,
     )
     store = Store(folder, backend, limits)
     print(f"resumed {len(store.sessions)} sessions", file=sys.stderr)

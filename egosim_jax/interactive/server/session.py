@@ -10,16 +10,18 @@
     steps/N/info.json         metadata of the step; with this file, the step is committed
     saved/NAME/               starts that the client saved
 
-A request is on disk before its step runs. A restarted server therefore finishes an interrupted step
-from its last finished phase. A failed step is removed, and the session stays at the step before.
+A request is on disk before its step runs, unless it is given in parts (`parts.py`). A restarted
+server therefore finishes an interrupted step from its last finished phase. A failed step is
+removed, and the session stays at the step before.
 """
 
 from __future__ import annotations
 
 import shutil
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, no_type_check
@@ -28,18 +30,19 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from egosim_jax import configs
-from egosim_jax.interactive.env.action_spec import ActionSpec, to_numbers
+from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import Backend
 from egosim_jax.interactive.env.batching import announced
 from egosim_jax.interactive.env.chunks import Chunk, last_camera, make_chunk, state_info, view_of
 from egosim_jax.interactive.env.validity import validity
 from egosim_jax.interactive.server import wire
 from egosim_jax.interactive.server.errors import RequestError
+from egosim_jax.interactive.server.requests import request_hash
 from egosim_jax.io.bounded import quote, quote_path, read_json
-from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.run import write_json
 from egosim_jax.simulation.actions import load_placed, save_placed
-from egosim_jax.simulation.rollout import Rollout, load_clip
+from egosim_jax.simulation.rollout import RecordedClip, Rollout, load_clip
+from egosim_jax.simulation.simulator import Show
 from egosim_jax.simulation.start import Start
 from egosim_jax.state import snapshot
 from egosim_jax.types import Action, Cameras, InputError, SceneState
@@ -48,8 +51,6 @@ SETTINGS, CLOSED = "session.json", "closed.json"
 INFO, REQUEST, ACTION = "info.json", "request.json", "action"
 ACTION_FILE = f"{ACTION}.npz"
 FIRST = "first"
-Show = Callable[[UInt8[np.ndarray, "g h w 3"]], None]
-"""Callback for each decoded group of frames."""
 DAMAGE = (InputError, OSError, ValueError, KeyError, TypeError, IndexError)
 """Errors that reading a damaged session can raise."""
 
@@ -82,7 +83,7 @@ class Session:
         self.id = folder.name
         self.actions = ActionSpec.from_json(settings_of(folder)["actions"])
         self.busy = threading.Lock()
-        self.in_flight: tuple[tuple[int, str], Future[Result]] | None = None
+        self.in_flight: tuple[tuple[int, str], Future[Any]] | None = None
         """Number and request hash of the running step, and its future result."""
         steps = [int(p.name) for p in (folder / "steps").glob("[0-9]*")]
         self.committed = max((n for n in steps if self._is_committed(n)), default=0)
@@ -229,6 +230,17 @@ class Session:
         and for another action under a used number.
         """
         request = request_hash(rows, prompt)
+        if (known := self.committed_result(step_id, request)) is not None:
+            return known
+        video = self.backend.video
+        chunk = make_chunk(self.actions, rows, start=self.now, video=video, prompt=prompt)
+        return self.commit(step_id, chunk, request, show)
+
+    def committed_result(self, step_id: int, request: str) -> Result | None:
+        """Return the result of a step that is committed; None for the next step.
+
+        Raises `RequestError` for a step out of order, and for another action under a used number.
+        """
         if step_id <= self.committed:
             return self._repeated(step_id, request)
         if step_id != self.committed + 1:
@@ -238,14 +250,23 @@ class Session:
                 f"Step {step_id} cannot follow step {self.committed}: step_id must be one more "
                 f"than the last committed step. Send step {self.committed + 1}.",
             )
-        video = self.backend.video
-        chunk = make_chunk(self.actions, rows, start=self.now, video=video, prompt=prompt)
+        return None
+
+    def commit(
+        self,
+        step_id: int,
+        chunk: Chunk,
+        request: str,
+        show: Show | None = None,
+        frames: UInt8[np.ndarray, "f h w 3"] | None = None,
+    ) -> Result:
+        """Accept, make and commit a step; its frames are given if they are made already."""
         try:
             self._accept(step_id, chunk, request)
         except OSError:
             self._drop(step_id)
             raise
-        return self.finish(show)
+        return self.finish(show, frames)
 
     def _repeated(self, step_id: int, request: str) -> Result:
         if self.hash_of(step_id) != request:
@@ -271,23 +292,31 @@ class Session:
         write_json(folder / REQUEST, fields)
         save_placed(folder, ACTION, chunk.action)
 
-    def finish(self, show: Show | None = None) -> Result:
-        """Make and commit the accepted step, from its last finished phase.
+    def finish(
+        self, show: Show | None = None, frames: UInt8[np.ndarray, "f h w 3"] | None = None
+    ) -> Result:
+        """Make and commit the accepted step, from its last finished phase or from its frames.
 
         After an error the step is removed.
         """
         try:
-            self.result = self._last = self._run(self.committed + 1, show)
+            self.result = self._last = self._run(self.committed + 1, show, frames)
         except Exception:
             self._drop(self.committed + 1)
             raise
         self.committed += 1
         return self.result
 
-    def _run(self, number: int, show: Show | None) -> Result:
+    def _run(
+        self, number: int, show: Show | None, frames: UInt8[np.ndarray, "f h w 3"] | None
+    ) -> Result:
         folder, action, now = self._step(number), self.action(number), self.now
         simulator = replace(self.backend.simulator(now), show=show)
-        with announced(simulator.generator):
+        generator = simulator.generator
+        if frames is not None:
+            made = RecordedClip(generator=generator, frames=frames)
+            simulator = replace(simulator, generator=made)
+        with announced(generator) if frames is None else nullcontext():
             (step,) = Rollout(simulator, folder / "rollout").run(
                 now.state, [action], seed=now.seed + now.steps, first_frame=now.first_frame
             )
@@ -389,8 +418,3 @@ def check_world(folder: Path, backend: Backend) -> None:
                 f"{quote(value)}: they must be equal. Start egosim serve with the options of the "
                 "session, or create a new session."
             )
-
-
-def request_hash(rows: object, prompt: str | None) -> str:
-    """Return the hash that identifies a repeated step. Raises `InputError` for invalid rows."""
-    return fingerprint((to_numbers(rows), prompt))

@@ -13,7 +13,7 @@ import time
 import traceback
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,12 +21,16 @@ from typing import Any, TypeVar
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import Backend
 from egosim_jax.interactive.server.errors import RequestError, as_request_error
+from egosim_jax.interactive.server.limits import Limits
+from egosim_jax.interactive.server.parts import PartResult, Parts
 from egosim_jax.interactive.server.prometheus import Metrics
 from egosim_jax.interactive.server.requests import (
     check_integer,
     check_mapping,
     check_name,
+    part_of,
     prompt_of,
+    request_hash,
 )
 from egosim_jax.interactive.server.session import (
     CLOSED,
@@ -34,16 +38,15 @@ from egosim_jax.interactive.server.session import (
     SETTINGS,
     Result,
     Session,
-    Show,
     check_world,
-    request_hash,
 )
 from egosim_jax.io.atomic import atomic_write, lock_folder
 from egosim_jax.io.bounded import quote, quote_path
 from egosim_jax.runtime.terminal import printable
 from egosim_jax.simulation.episode import Episode
+from egosim_jax.simulation.simulator import Show
 from egosim_jax.simulation.start import Start, check_size
-from egosim_jax.types import InputError, check_counts
+from egosim_jax.types import InputError
 
 T = TypeVar("T")
 UNFINISHED = re.compile(r"starts|\.session\..*")
@@ -58,42 +61,13 @@ PROBE = ".probe"
 """Name of a file that is written to know whether the disk has space."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Limits:
-    """Limits of a server."""
-
-    sessions: int = 64
-    """Maximum number of open sessions."""
-    queue: int = 32
-    """Maximum number of waiting and running requests."""
-    threads: int = 8
-    """Maximum number of concurrent steps."""
-    steps: int = 10_000
-    """Maximum number of steps of a session."""
-    saved: int = 100
-    """Maximum number of saved starts of a session."""
-    kept: int = 1000
-    """Maximum number of sessions that are closed and kept."""
-    connections: int = 256
-    """Maximum number of client connections."""
-    step_timeout_s: float = 120.0
-    """Maximum time that a request waits for its step; the step then continues without it."""
-
-    def __post_init__(self) -> None:
-        """Raise `InputError` unless all limits are positive."""
-        check_counts({"queue": self.queue, "threads": self.threads, "sessions": self.sessions})
-        check_counts({"steps of a session": self.steps, "saved starts": self.saved})
-        check_counts({"connections": self.connections, "kept sessions": self.kept})
-        if not self.step_timeout_s > 0:
-            raise InputError(f"The timeout is {self.step_timeout_s} s: it must be positive.")
-
-
 class Store:
     """Sessions in a folder; the folder is locked while the store is open."""
 
     def __init__(self, folder: Path, backend: Backend, limits: Limits):
         self.folder, self.backend, self.limits = folder, backend, limits
         self.metrics = Metrics()
+        self.parts = Parts(most=limits.open_steps, idle_s=limits.step_timeout_s)
         self.sessions: dict[str, Session] = {}
         self.damaged: dict[str, str] = {}
         self.draining = False
@@ -216,8 +190,13 @@ class Store:
         check_size(start, self.backend.video)
         return start if prompt is None else replace(start, prompt=prompt)
 
-    def step(self, request: Mapping[str, Any], show: Show | None = None) -> Future[Result]:
-        """Queue a step of a session; `show` gets the frames of a new step only."""
+    def step(
+        self, request: Mapping[str, Any], show: Show | None = None
+    ) -> Future[Result | PartResult]:
+        """Queue a step of a session or, if the request has one, a part of it.
+
+        `show` gets the frames of a new step only.
+        """
         session = self.get(request.get("session"))
         step_id, prompt = check_integer(request.get("step_id"), "step_id"), prompt_of(request)
         if step_id < 1:
@@ -234,12 +213,16 @@ class Store:
             )
         if "actions" not in request:
             raise InputError("The step has no actions: give rows of numbers.")
-        rows = request["actions"]
+        rows, part = request["actions"], part_of(request)
         flight = session.in_flight
-        key = step_id, request_hash(rows, prompt)
+        key = step_id, request_hash(rows, prompt, part)
         if flight is not None and flight[0] == key and not flight[1].done():
             return flight[1]  # a client that reconnected waits for its running step
-        run = partial(session.step, step_id, rows, prompt, show)
+        run: Callable[[], Result | PartResult]
+        if part is None:
+            run = partial(session.step, step_id, rows, prompt, show)
+        else:
+            run = partial(self.parts.step, session, step_id, part, rows, prompt, show)
         if step_id <= session.committed:  # a repeated step only reads, so it may run concurrently
             return self.submit(run)
         future = self.submit(run, changes=session)

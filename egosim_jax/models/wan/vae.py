@@ -233,19 +233,29 @@ class WanVAE(nnx.Module):
         and width in multiples of 8.
         """
         self._check(video)
-        first, cache = self.encoder(video[:, :1], None)
+        return self.encode_next(video, None)[0]
+
+    def encode_next(
+        self, video: Float[Array, "b f h w 3"], cache: Cache
+    ) -> tuple[Float[Array, "b f2 h2 w2 z"], Cache]:
+        """Return the latents of the next frames of a video, and the cache for those after them.
+
+        The first frames have no cache and number 4k+1; all others number 4k.
+        """
+        found = []
+        if cache is None:
+            first, cache = self.encoder(video[:, :1], None)
+            found, video = [first], video[:, 1:]
 
         def step(cache: Cache, frames: Array) -> tuple[Cache, Array]:
             hidden, cache = self.encoder(frames, cache)
             return cache, hidden
 
-        groups = rearrange(
-            video[:, 1:], "b (n f) h w c -> n b f h w c", f=self.config.temporal_stride
-        )
-        _, rest = jax.lax.scan(step, cache, groups)
-        rest = rearrange(rest, "n b f h w c -> b (n f) h w c")
-        moments = self.to_moments(jnp.concatenate([first, rest], axis=1))
-        return self.normalize(moments[..., : self.config.z_dim].astype(jnp.float32))
+        groups = rearrange(video, "b (n f) h w c -> n b f h w c", f=self.config.temporal_stride)
+        cache, rest = jax.lax.scan(step, cache, groups)
+        found.append(rearrange(rest, "n b f h w c -> b (n f) h w c"))
+        moments = self.to_moments(jnp.concatenate(found, axis=1))
+        return self.normalize(moments[..., : self.config.z_dim].astype(jnp.float32)), cache
 
     def decode(self, latents: Float[Array, "b f h w z"]) -> Float[Array, "b f2 h2 w2 3"]:
         """Return the video of normalized latents, float32 in [-1, 1], frame by latent frame."""

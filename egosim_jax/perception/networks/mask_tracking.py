@@ -70,7 +70,7 @@ class TrackMasks:
             path = self.follow(points, gray, ids == number, depth, cameras)
             moving = _moving_frames(points, path, cameras, self.min_motion_px)
             if moving.any():
-                model = object_model(number, state, self.model)
+                model = object_model(number, state, self.model, cameras.world_from_camera[0])
                 motions[number] = self._refine(model, path, moving, clip, cameras, state, ids)
                 planes[number] = model.plane
         return replace(so_far, motions=motions, support_planes=planes)

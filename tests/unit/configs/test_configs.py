@@ -18,9 +18,12 @@ def test_every_config_knows_its_own_name():
         "dwm_tabletop",
         "dwm_wan_14b",
         "egosim_14b",
+        "egosim_14b_student",
         "egosim_1_3b",
+        "egosim_1_3b_student",
         "real_tiny",
         "tabletop",
+        "tabletop_student",
     ]
     assert [configs.get(name).name for name in configs.names()] == configs.names()
 

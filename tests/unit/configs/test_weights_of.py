@@ -16,7 +16,14 @@ from egosim_jax.io.run import write_json
 from egosim_jax.train import recipes
 from egosim_jax.types import InputError
 
-TRAINED = ("debug", "real_tiny", "dwm_tabletop", "egosim_1_3b")
+TRAINED = (
+    "debug",
+    "real_tiny",
+    "dwm_tabletop",
+    "egosim_1_3b",
+    "egosim_14b_student",
+    "egosim_1_3b_student",
+)
 
 
 @pytest.mark.parametrize("name", TRAINED)
@@ -32,7 +39,9 @@ def test_a_model_without_weights_names_its_training(name, tmp_path, monkeypatch)
     assert given <= fields
 
 
-@pytest.mark.parametrize("name", sorted(set(configs.names()) - {*TRAINED, "tabletop"}))
+@pytest.mark.parametrize(
+    "name", sorted(set(configs.names()) - {*TRAINED, "tabletop", "tabletop_student"})
+)
 def test_a_released_model_without_weights_names_fetch_or_convert(name, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     commands = rf"egosim models fetch {name}|egosim convert weights DOWNLOAD --config {name} --out"

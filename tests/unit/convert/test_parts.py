@@ -131,6 +131,15 @@ def test_bit_equal_weights_have_one_hash_whatever_their_file(network, tmp_path):
     assert len(found.pop()) == 64
 
 
+def test_a_student_counts_only_where_it_is_used(tmp_path):
+    """A run of the teacher resumes after a student was put into its folder."""
+    ours(tmp_path, "dit")
+    teacher = weights.hashes(tmp_path)
+    weights.write(tmp_path / weights.STUDENT, {"a.kernel": np.ones((2, 3), np.float16)})
+    assert weights.hashes(tmp_path) == teacher
+    assert set(weights.hashes(tmp_path, student=True)) == {"dit", "student"}
+
+
 @pytest.mark.parametrize("change", ["value", "name", "dtype", "shape", "sign of zero"])
 def test_other_weights_have_another_hash(change, tmp_path):
     values = {"a.kernel": np.zeros((2, 3), np.float32), "b": np.ones(3, np.float16)}

@@ -82,6 +82,7 @@ CONFIG = MixerConfig()
 MODEL = SimpleNamespace(
     name="mixer", dit=CONFIG, networks={"dit": CONFIG}, layout=LAYOUT,
     tokenizer=SimpleNamespace(kind="byt5"),
+    chunks=None,
 )  # fmt: skip
 
 

@@ -19,9 +19,9 @@ from jax.experimental.compilation_cache import compilation_cache
 from egosim_jax import configs
 from egosim_jax.configs.model import Networks
 from egosim_jax.generation.generator import Generator
-from egosim_jax.generation.stream import Streamer
 from egosim_jax.io import executables, private
 from egosim_jax.io.executables import cached_compile
+from tests.flags import devices
 
 GIVEN = (jax.ShapeDtypeStruct((3,), jnp.float32),)
 WIDE = jax.ShapeDtypeStruct((64, 64), jnp.float32)
@@ -97,11 +97,11 @@ def test_every_module_that_runs_while_tracing_is_part_of_the_key():
             files.add(frame.f_code.co_filename)
 
     jax.clear_caches()
-    programs = [(function, args) for _, function, args in generator.programs(1)]
-    latents = jax.ShapeDtypeStruct(
-        (1, 1, *config.latent_shape[1:], config.vae.latent_channels), jnp.float32
-    )
-    programs.append((Streamer(generator)._next, (latents, None)))
+    programs = [
+        (function, args)
+        for streamed in (False, True)
+        for _, function, args in generator.programs(1, streamed=streamed)
+    ]
     for function, args in programs:
         sys.setprofile(record)
         try:
@@ -353,3 +353,23 @@ def test_what_jaxs_own_cache_has_is_stored_completely(folder, tmp_path):
         jax.config.update(least, before[0])
         jax.config.update("jax_compilation_cache_dir", before[1])
         compilation_cache.reset_cache()
+
+
+ONE_OF_TWO = """
+import jax
+from egosim_jax.io.executables import cached_compile
+from tests.flags import devices
+
+given = (jax.ShapeDtypeStruct((3,), "float32"),)
+compile_fn = lambda: jax.jit(lambda x: 2 * x).lower(*given).compile()  # noqa: E731
+for _ in range(2):
+    print(cached_compile("one of two", given, compile_fn)(jax.numpy.arange(3.0)))
+"""
+
+
+def test_a_function_of_one_device_is_loaded_for_one_of_several(tmp_path):
+    environment = os.environ | devices(2) | {"XDG_CACHE_HOME": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", ONE_OF_TWO], env=environment, capture_output=True, text=True
+    )
+    assert done.stdout == "[0. 2. 4.]\n" * 2, done.stderr

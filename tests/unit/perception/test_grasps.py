@@ -12,6 +12,7 @@ from egosim_jax.perception.grasps import (
     couplings,
     find_holds,
     hinge_motion,
+    is_along_edge,
     is_behind,
     is_between,
     is_firm,
@@ -115,6 +116,10 @@ def test_a_hinge_turns_a_held_object_about_its_axis():
     np.testing.assert_allclose(found[1:9], true, atol=1e-9)
     np.testing.assert_array_equal(found[0], np.eye(4))
     np.testing.assert_array_equal(found[9], found[8])
+    along = axis * np.linspace(-0.1, 0.1, 9)[:, None]
+    lid = point + along + np.cross(axis, [0, 0, 1]) * 0.12 * np.array([[0.1], [0.5], [1]])[:, None]
+    assert is_along_edge(lid.reshape(-1, 3), found)
+    assert not is_along_edge(lid.reshape(-1, 3) + [0, -0.05, 0], found)
 
 
 @pytest.mark.parametrize("bend_m", [0.0, 0.01])

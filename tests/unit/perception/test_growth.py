@@ -111,6 +111,14 @@ def test_a_stacked_object_of_the_same_color_ends_at_the_concave_edge():
     assert any(0.7 * len(above[0]) < size < 1.2 * len(above[0]) for size in sizes), sizes
 
 
+def test_colors_say_which_points_of_a_concave_edge_are_an_objects():
+    points, _ = box((-0.06, -0.06, 0), (0.06, 0.06, 0.04), BLUE)
+    below = points[(np.abs(points[:, :2]) >= 0.02).any(axis=1)], BLUE
+    above = box((-0.02, -0.02, 0.04), (0.02, 0.02, 0.08), RED)
+    growths = grown(scene(below, above), closed_on((-0.025, 0, 0.07), (0.025, 0, 0.07)))
+    assert {RED: len(above[0]), BLUE: 0, WOOD: 0} in growths
+
+
 @pytest.mark.parametrize(
     ("clusters", "note"),
     [

@@ -3,13 +3,8 @@
 import numpy as np
 import pytest
 
-from egosim_jax.perception.object_motion import (
-    TrackObjects,
-    _support_plane,
-    fall,
-    object_model,
-    snap,
-)
+from egosim_jax.perception.falling import fall, snap
+from egosim_jax.perception.object_motion import TrackObjects, _support_plane, object_model
 from egosim_jax.perception.pose_refinement import ObjectModel, ObjectMotion
 from egosim_jax.types import SceneState
 
@@ -52,7 +47,8 @@ def test_the_supporting_plane_is_the_same_in_every_run():
     wall = rng.uniform(-0.14, 0.14, (3000, 3)) * [1, 0, 1] + [0, 0.14, 0]
     others = np.concatenate([table, wall]).astype(np.float32)
     points = rng.uniform(-0.03, 0.03, (200, 3))
-    planes = {_support_plane(points, others, TrackObjects()).tobytes() for _ in range(12)}
+    z = np.array([0.0, 0.0, 1.0])
+    planes = {_support_plane(points, others, TrackObjects(), z, None).tobytes() for _ in range(12)}
     assert len(planes) == 1
     normal = np.frombuffer(planes.pop())[:3]
     assert abs(normal[2]) > 0.99
@@ -70,9 +66,25 @@ def test_an_object_without_a_surface_around_it_has_a_horizontal_plane(provenance
         intrinsics_px=np.eye(3),
         provenance=provenance,
     )
-    plane = object_model(1, state, TrackObjects()).plane
+    plane = object_model(1, state, TrackObjects(), np.eye(4)).plane
     np.testing.assert_array_equal(plane[:3], up)
     assert np.isnan(plane[3])
+
+
+@pytest.mark.parametrize(
+    ("up", "eye_m"),
+    [([0, 0, 1], None), ([0, 0.6, 0.8], [0, -0.4, 0.3]), ([0, 0.96, 0.28], [0, -0.1, 0.35])],
+    ids=["known", "camera", "camera looking far down"],
+)
+def test_the_side_of_a_box_supports_nothing(up, eye_m):
+    """A wall next to the object has more points than the table."""
+    rng = np.random.default_rng(0)
+    table = rng.uniform(-0.1, 0.1, (400, 3)) * [1, 1, 0]
+    wall = rng.uniform(-0.1, 0.1, (2000, 3)) * [1, 0, 1] + [0, 0.09, 0.1]
+    others = np.concatenate([table, wall]).astype(np.float32)
+    eye = None if eye_m is None else np.array(eye_m)
+    plane = _support_plane(np.zeros((30, 3)), others, TrackObjects(), np.array(up, float), eye)
+    np.testing.assert_allclose(plane, [0, 0, 1, 0], atol=0.01)
 
 
 @pytest.mark.parametrize("plane", [TABLE, -TABLE])
@@ -126,6 +138,14 @@ def test_what_was_put_down_has_its_first_height_above_the_support(end_m, height_
     np.testing.assert_allclose(path[-1, :3, 3], [*end_m[:2], height_m], atol=1e-6)
     np.testing.assert_allclose(path[8, :3, 3], path[-1, :3, 3] / 2, atol=1e-9)
     np.testing.assert_array_equal(path[:5], carried(end_m).path[:5])
+
+
+@pytest.mark.parametrize("rise_m", [0.002, -0.003])
+def test_a_drawer_that_slides_out_of_its_case_keeps_its_height(rise_m):
+    """Its case, and not what it rests on, is below it at first; later it is above the table."""
+    case = np.concatenate([TOP * [0.1, 0.1, 0] + [0, 0, 0.71], TOP]).astype(np.float32)
+    pulled = snap(carried([0, -0.1, rise_m]), case)
+    np.testing.assert_allclose(pulled.path[-1, :3, 3], [0, -0.1, 0], atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from dataclasses import dataclass, replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from egosim_jax.simulation.rollout import Rollout
 from egosim_jax.simulation.simulator import Simulator
 from egosim_jax.state.snapshot import fingerprint
 from egosim_jax.state.tsdf import Fusion
-from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.types import InputError, Perceived, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_action, to_ground_truth
 
 SPEC = VideoSpec(frames=5, height=48, width=80, fps=8)
@@ -295,3 +296,45 @@ def test_seeds_of_all_steps_must_be_valid(tmp_path, make):
     with pytest.raises(InputError, match=r"seed . number of actions must be a whole number"):
         next(steps)
     assert not (tmp_path / "clip_1").exists()
+
+
+@dataclass(frozen=True)
+class ChunkedPainter:
+    """`paint_the_hands` in chunks of 3 and 2 frames."""
+
+    chunk_frames = (3, 2)
+
+    def __call__(self, *given):
+        return paint_the_hands(*given)
+
+    def begin(self, first_frame, seed):
+        given = []
+        take = lambda: iter([paint_the_hands(*given.pop(0), first_frame, seed)])  # noqa: E731
+        return SimpleNamespace(put=lambda view, action: given.append((view, action)), take=take)
+
+
+def count_chunks(clip, action, state):
+    """Perception of a clip in which nothing moves; its note has the chunk."""
+    depth_m = np.full(clip.frames.shape[:3], np.inf, np.float32)
+    return Perceived(
+        step=state.step + 1, frames=clip.frames, cameras=action.cameras, depth_m=depth_m,
+        object_ids=np.zeros(depth_m.shape, np.int32), names={}, world_from_object={},
+        interacted_frames={}, notes=(f"{len(clip.frames)} frames after {state.step}",),
+    )  # fmt: skip
+
+
+def test_a_run_that_updates_the_state_by_chunk_resumes_with_the_same_states(tmp_path):
+    changes = {
+        "generator": ChunkedPainter(), "perception": count_chunks, "update_every": "chunk",
+    }  # fmt: skip
+    made = run(tmp_path, **changes)
+    assert [step.notes[0] for step in made] == ["3 frames after 0", "3 frames after 2"]
+    assert [step.state.step for step in made] == [2, 4]
+    again = run(tmp_path, **changes)
+    assert [step.notes for step in again] == [step.notes for step in made]
+    assert [fingerprint(step.state) for step in again] == [fingerprint(s.state) for s in made]
+    for step, before in zip(again, made, strict=True):
+        np.testing.assert_array_equal(step.view.frames, before.view.frames)
+        assert step.latency.last_frame_s == before.latency.last_frame_s
+    with pytest.raises(InputError, match="update_every: recorded"):
+        run(tmp_path, **{**changes, "update_every": "clip"})

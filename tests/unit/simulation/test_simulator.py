@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from egosim_jax.rendering import reference
-from egosim_jax.simulation.simulator import Simulator
-from egosim_jax.types import Clip, VideoSpec
+from egosim_jax.simulation.actions import split_action
+from egosim_jax.simulation.simulator import Simulator, check_update_every
+from egosim_jax.types import Clip, InputError, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_action
 
 SPEC = VideoSpec(frames=5, height=48, width=80, fps=8)
@@ -83,3 +84,56 @@ def test_points_have_the_size_that_the_generator_names(clip):
     view = Simulator(generator=Marked(), perception=None, fps=8).render(clip.state, to_action(clip))
     expected = reference.render(clip.state, clip.cameras, point_px=3)
     np.testing.assert_array_equal(view.frames, expected.frames)
+
+
+class Chunked:
+    """Generator of chunks of 3 and 2 frames, which shows the view with a little of each hand."""
+
+    chunk_frames = (3, 2)
+    renderer, point_px = reference, 2
+
+    def __call__(self, view, action, first_frame, seed):
+        hands, depth = reference.draw_hands(action.joints_m, action.cameras, kind=action.kind)
+        return np.where((depth < view.depth_m)[..., None], hands, view.frames)
+
+    def begin(self, first_frame, seed):
+        given = []
+
+        def take():
+            frames = self(*given.pop(0), first_frame, seed)
+            yield frames[:1]
+            yield frames[1:]
+
+        return SimpleNamespace(put=lambda view, action: given.append((view, action)), take=take)
+
+
+def test_a_clip_of_chunks_is_the_clip_made_at_once(clip):
+    action, shown = to_action(clip), []
+    simulator = Simulator(generator=Chunked(), perception=None, fps=8, show=shown.append)
+    step = simulator.step(clip.state, action, seed=5)
+    view = simulator.render(clip.state, action)
+    assert [len(frames) for frames in shown] == [1, 2, 1, 1]
+    np.testing.assert_array_equal(step.clip.frames, Chunked()(view, action, None, 5))
+    for name in ("frames", "mask", "depth_m", "object_ids"):
+        np.testing.assert_array_equal(getattr(step.view, name), getattr(view, name))
+    assert 0 < step.latency.first_frame_s < step.latency.last_frame_s
+
+
+def test_a_hand_that_comes_into_view_later_is_missing_from_the_chunks_before(clip):
+    action = to_action(clip)
+    joints = action.joints_m.copy()
+    joints[:3] += [0, -50, 0]  # behind the wearer
+    first, second = split_action(replace(action, joints_m=joints), (3, 2))
+    assert np.isnan(first.joints_m).all()
+    np.testing.assert_array_equal(second.joints_m, joints[3:])
+
+
+@pytest.mark.parametrize(
+    ("chunks", "perception", "message"),
+    [((5,), "classical", "tiny makes clips at once"), ((3, 2), "recorded --x 1", "by number")],
+)
+def test_what_cannot_update_the_state_by_chunk_is_refused(chunks, perception, message):
+    with pytest.raises(InputError, match=message):
+        check_update_every("chunk", chunks, "tiny", perception)
+    check_update_every("clip", chunks, "tiny", perception)
+    check_update_every("chunk", (3, 2), "tiny", "classical")

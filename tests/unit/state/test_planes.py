@@ -34,6 +34,14 @@ def test_table_and_shelf_are_support_planes_and_wall_and_box_are_not(room):
     assert table.heights(np.array([[0, 0.2, 0.8]])) == pytest.approx(0.1, abs=0.01)
 
 
+def test_a_point_is_on_one_plane_only():
+    table = patch([-0.5, 0, 0.7], [1, 0, 0], [0, 0.6, 0], 4000)
+    slanted = patch([-0.2, 0, 0.66], [0.4, 0, 0], [0, 0.6, 0.06], 2000)  # it crosses the table
+    one, other = support_planes(np.concatenate([table, slanted]), UP)
+    assert not np.intersect1d(one.inliers, other.inliers).size
+    assert (other.inliers >= len(table)).mean() > 0.95
+
+
 def test_two_searches_find_the_same_planes(room):
     first, second = (support_planes(room, UP) for _ in range(2))
     for one, other in zip(first, second, strict=True):

@@ -21,6 +21,7 @@ class Counting:
 
     renderer = reference
     point_px = 2
+    chunk_frames = (2,)
 
     def __init__(self):
         self.batches, self.held = [], threading.Event()
@@ -45,6 +46,8 @@ class Counting:
 
     def __call__(self, *_):
         raise AssertionError
+
+    begin = __call__
 
 
 @functools.cache

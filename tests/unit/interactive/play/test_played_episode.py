@@ -13,7 +13,7 @@ from egosim_jax.interactive.server.session import Session
 from egosim_jax.simulation.simulator import Simulator
 from egosim_jax.state import snapshot
 from egosim_jax.types import InputError
-from tests.painted import VIDEO, PaintedWorld, Painter
+from tests.painted import VIDEO, ChunkPainter, PaintedWorld, Painter
 
 STILL = np.zeros(6)
 
@@ -111,3 +111,26 @@ def test_the_preview_shows_the_hand(played):
     lower = replace(played.hand, point_m=played.hand.point_m - [0, 0, 0.05])
     assert (played.preview(lower, STILL) != near).any()
     assert (played.preview(played.hand, np.array([0, 0, 0, 0, 0.2, 0])) != near).any()
+
+
+def test_the_hand_is_steered_while_a_clip_is_made(tmp_path):
+    world = PaintedWorld(generator=ChunkPainter(), video=VIDEO, perception=None)
+    start = tabletop_start(0, ActionSpec(camera=True), VIDEO)
+    steered, straight = (
+        PlayedEpisode(world, tmp_path / name, start, "right") for name in ("a", "b")
+    )
+    there = replace(straight.hand, point_m=straight.hand.point_m + [0, 0.08, 0])
+    shown = []
+    timing = straight.steer(
+        lambda: (there, STILL), "there", lambda frames, last: shown.append((len(frames), last))
+    )
+    assert shown == [(1, False), (2, False), (1, False), (1, True)]
+    assert 0 < timing.first_s <= timing.last_s <= timing.total_s
+    aims = iter([there, replace(there, point_m=there.point_m - [0.08, 0, 0])])
+    steered.steer(lambda: (next(aims), STILL), "elsewhere", lambda frames, last: None)
+    first, second = straight.now.frames, steered.now.frames
+    np.testing.assert_array_equal(first[:3], second[:3])
+    assert not np.array_equal(first[3:], second[3:])
+    np.testing.assert_allclose(straight.hand.point_m, there.point_m, atol=1e-6)
+    np.testing.assert_allclose(steered.hand.point_m, there.point_m - [0.08, 0, 0], atol=1e-6)
+    assert steered.now.truth.result()[1].shape == second.shape
