@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,8 @@ from egosim_jax.runtime.command import ExitCode
 from egosim_jax.runtime.terminal import make_console
 from egosim_jax.types import InputError
 
-VIDEO, SHEET, REPORT, DATASET = "robot.mp4", "sheet.jpg", "report.json", "lerobot"
+VIDEO, SHEET, REPORT = "robot.mp4", "sheet.jpg", "report.json"
+DATASET, TRIPLETS = "lerobot", "triplets"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,14 +37,18 @@ class List:
 
 @dataclass(frozen=True, kw_only=True)
 class Render:
-    """Replace the hands of an episode by robots that follow them (extra `robot`).
+    """Replace the hands of a clip by robots that follow them (extra `robot`).
 
-    Writes a video, a contact sheet, report.json and a LeRobot dataset (version 3.0) with joint
-    positions. The report names the frames that the robot does not reach, and by how much.
+    Writes a video, a contact sheet, report.json, a LeRobot dataset (version 3.0) with joint
+    positions, and training clips with the gripper's skeleton. The report names the frames that the
+    robot does not reach, and by how much.
     """
 
     source: Annotated[Path, tyro.conf.Positional]
-    """Episode with ground truth, as `egosim episode make` writes it: a folder or a .zip."""
+    """Clip with known hands and cameras, recognized by its files.
+
+    An episode with ground truth (`egosim episode make`), a clip of `egosim data annotate`, a run of
+    `egosim simulate`, or a session of `egosim serve` or `egosim play`."""
     robot: str
     """Name in `egosim robot list`."""
     out: Path
@@ -56,21 +62,29 @@ class Render:
 
     def run(self) -> int:
         """Convert the episode and write everything."""
+        from egosim_jax.data.clips import write_clips
         from egosim_jax.data.lerobot_writer import check_new
         from egosim_jax.data.sheet import SheetClip, draw_sheet
         from egosim_jax.io.run import write_json
         from egosim_jax.io.video import write_video
         from egosim_jax.robots.arms import arm_of
-        from egosim_jax.robots.conversion import convert, export, report_of, video_of
+        from egosim_jax.robots.conversion import (
+            convert,
+            export,
+            report_of,
+            triplets_of,
+            video_of,
+        )
         from egosim_jax.robots.models import load_model
-        from egosim_jax.simulation.episode import Episode
+        from egosim_jax.robots.sources import open_source
 
         arm = arm_of(self.robot)
         check_new(self.out)
-        episode = Episode.load(self.source)
         robot = load_model(arm)
         began = time.monotonic()
-        found = convert(episode, robot, hands=self.hands, base=self.base)
+        source = open_source(self.source)
+        episode = source.episode
+        found = convert(source, robot, hands=self.hands, base=self.base)
         self.out.mkdir(parents=True, exist_ok=True)
         write_video(self.out / VIDEO, video_of(found), episode.fps)
         first, truth = found.drawn[0], episode.ground_truth[0]
@@ -78,9 +92,11 @@ class Render:
         moments = [round(n * (len(truth.frames) - 1) / 5) for n in range(6)]
         draw_sheet([SheetClip(arm.title, rows)], self.out / SHEET, moments=moments)
         export(found, self.out / DATASET)
-        report = report_of(found)
+        name = re.sub("[^A-Za-z0-9_-]+", "_", f"{self.source.resolve().stem}_{arm.name}")
+        write_clips(self.out / TRIPLETS, triplets_of(found, name), fps=episode.fps)
+        report = {"source": self.source, "kind": source.kind, **report_of(found)}
         seconds = round(time.monotonic() - began, 1)
-        write_json(self.out / REPORT, {"source": self.source, **report, "seconds": seconds})
+        write_json(self.out / REPORT, {**report, "seconds": seconds})
         for entry in report["robots"]:
             print(
                 f"{entry['robot']} reaches {entry['reached']:.1%} of {entry['frames']} frames, "

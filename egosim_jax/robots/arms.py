@@ -6,6 +6,7 @@ Models are from the MuJoCo Menagerie (package `mujoco-menagerie`, which download
 
 from __future__ import annotations
 
+import difflib
 from dataclasses import dataclass
 from math import pi
 
@@ -168,8 +169,9 @@ ARMS = {arm.name: arm for arm in (PANDA, UR5E, XARM7, SO_ARM100, VX300S)}
 def arm_of(name: str) -> Arm:
     """Return an arm by name; raise `InputError` for an unknown name."""
     if name not in ARMS:
+        near = difflib.get_close_matches(name, ARMS, n=1, cutoff=0)[0]
         raise InputError(
-            f"There is no robot {name[:40]!r}: choose one of {', '.join(ARMS)}, listed by egosim "
-            "robot list. (--robot)"
+            f"There is no robot {name[:40]!r}. Did you mean {near!r}? Known: {', '.join(ARMS)}. "
+            "(--robot, egosim robot list)"
         )
     return ARMS[name]

@@ -1,7 +1,8 @@
 """Frames without hands: the scene behind them, from the state or from other frames.
 
 A hidden pixel takes, in this order, what the state shows there, with its objects where they are in
-that frame; what other frames of the clip show; or an inpainted color, which is counted as unknown.
+that frame; what the first frame without hands shows; what other frames of the clip show; or an
+inpainted color, which is counted as unknown.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from egosim_jax.geometry import pixel_rays, transform
 from egosim_jax.rendering.reference import add_margin, close_gaps, splat
 from egosim_jax.types import Cameras, GroundTruth, InputError, SceneState
 
-MARGIN_PX = 1
-"""Pixels around a hand that are mixed with its color."""
+FAR_M = 100.0
+"""Assumed depth of the first frame where nothing gives it: a turning camera shows it right."""
 NEIGHBORS = 8
 """Number of frames of a clip that others may take colors from."""
 INPAINT_PX = 3
@@ -46,15 +47,17 @@ class Background:
     """Number of pixels in the shadow of a hand, which have the state's color."""
     from_state: int
     """Number of hidden pixels that the state shows."""
+    from_first_frame: int
+    """Number of further ones that the first frame without hands shows."""
     from_frames: int
-    """Number of hidden pixels that only other frames show."""
+    """Number of further ones that other frames show."""
     unknown: int
     """Number of hidden pixels that nothing shows."""
 
 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
-class _Cloud:
+class Cloud:
     """Colored points where they are in the first frame of a clip."""
 
     points_m: Float[np.ndarray, "n 3"]
@@ -63,8 +66,8 @@ class _Cloud:
 
     def view(
         self, cameras: Cameras, motions: Mapping[int, np.ndarray], frame: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return color and depth of a frame, whose objects have moved."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return color, depth and ids of a frame, whose objects have moved."""
         points = self.points_m.astype(float)
         for number, motion in motions.items():
             own = self.object_ids == number
@@ -72,13 +75,40 @@ class _Cloud:
         camera = _one(cameras, frame)
         depth, index = close_gaps(*splat(points, add_margin(camera), point_px=1))
         colors = np.concatenate([self.colors, np.zeros((1, 3), np.uint8)])
-        return colors[index[0]], depth[0]
+        return colors[index[0]], depth[0], np.append(self.object_ids, 0)[index[0]]
 
 
-def remove_hands(state: SceneState, cameras: Cameras, truth: GroundTruth) -> Background:
+def cloud_of(state: SceneState) -> Cloud:
+    """Return the points of a state."""
+    return Cloud(points_m=state.points_m, colors=state.colors, object_ids=state.object_ids)
+
+
+def first_cloud(image: UInt8[np.ndarray, "h w 3"], state: SceneState, cameras: Cameras) -> Cloud:
+    """Return the fixed scene that the first frame without hands shows, in the world.
+
+    `cameras` begin with the camera of the frame. Depth and ids are the state's.
+    """
+    _, depth, ids = cloud_of(state).view(cameras, {}, 0)
+    rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
+    local = rays * np.where(np.isfinite(depth), depth, FAR_M)[..., None]
+    fixed = ids == 0
+    points = transform(cameras.world_from_camera[0], local[fixed])
+    return Cloud(points_m=points, colors=image[fixed], object_ids=np.zeros(len(points), int))
+
+
+def remove_hands(
+    state: SceneState,
+    cameras: Cameras,
+    truth: GroundTruth,
+    *,
+    first: Cloud | None = None,
+    margin_px: int = 1,
+) -> Background:
     """Return the frames of a clip without hands, from the state before it and its ground truth.
 
-    Raises `InputError` if the ground truth has no depth or ids.
+    `first` has the points of the first frame without hands. `margin_px` is the width of the edge
+    of a hand that is hidden, too. Where the depth is unknown, it is the state's. Raises
+    `InputError` if the ground truth has no depth or ids.
     """
     import cv2
 
@@ -88,39 +118,46 @@ def remove_hands(state: SceneState, cameras: Cameras, truth: GroundTruth) -> Bac
             "The episode has no depth and ids of its frames, which say what hides the robot: make "
             "one with ground truth, such as egosim episode make --seed 0. (SOURCE)"
         )
-    square = np.ones((2 * MARGIN_PX + 1,) * 2, np.uint8)
+    square = np.ones((2 * margin_px + 1,) * 2, np.uint8)
     hidden = np.stack([cv2.dilate((m < 0).astype(np.uint8), square) for m in ids]) > 0
-    scene = _Cloud(points_m=state.points_m, colors=state.colors, object_ids=state.object_ids)
+    scene = cloud_of(state)
     frames, depth, missing = truth.frames.copy(), known_m.copy(), hidden.copy()
-    shadow = 0
-    (with_hands,) = np.nonzero(hidden.any(axis=(1, 2)))
-    for n in with_hands.tolist():
-        colors, seen_m = scene.view(cameras, motions, n)
+    shadow, counts = 0, [int(hidden.sum())]
+
+    def take(n: int, taken: np.ndarray, colors: np.ndarray, seen_m: np.ndarray) -> None:
+        frames[n][taken], depth[n][taken] = colors[taken], seen_m[taken]
+        missing[n] &= ~taken
+
+    unclear = hidden | ~np.isfinite(known_m)
+    for n in np.flatnonzero(unclear.any(axis=(1, 2))).tolist():
+        colors, seen_m, _ = scene.view(cameras, motions, n)
         fixed = (ids[n] == 0) & (abs(seen_m - depth[n]) < SAME_M) & ~hidden[n]
         shaded = fixed & _in_shadow(frames[n], colors, hidden[n])
         shadow += int(shaded.sum())
-        taken = shaded | (hidden[n] & np.isfinite(seen_m))
-        frames[n][taken], depth[n][taken] = colors[taken], seen_m[taken]
-        missing[n] &= ~taken
-    from_state = int(hidden.sum() - missing.sum())
-    around = _neighbors(cameras, frames, known_m, ids, hidden, motions)
+        take(n, shaded | (hidden[n] & np.isfinite(seen_m)), colors, seen_m)
+        depth[n] = np.where(np.isfinite(depth[n]), depth[n], seen_m)
+    counts.append(int(missing.sum()))
+    around = _neighbors(cameras, frames, depth, ids, hidden, motions)
+    for cloud in (first, around):
+        left = missing.any(axis=(1, 2)) if cloud is not None else np.zeros(len(frames), bool)
+        for n in np.flatnonzero(left).tolist():
+            colors, seen_m, _ = cloud.view(cameras, motions, n)
+            take(n, missing[n] & np.isfinite(seen_m), colors, seen_m)
+        counts.append(int(missing.sum()))
     for n in np.flatnonzero(missing.any(axis=(1, 2))).tolist():
-        colors, seen_m = around.view(cameras, motions, n)
-        taken = missing[n] & np.isfinite(seen_m)
-        frames[n][taken], depth[n][taken] = colors[taken], seen_m[taken]
-        missing[n] &= ~taken
         depth[n][missing[n]] = np.inf
         hole = missing[n].astype(np.uint8)
         frames[n] = cv2.inpaint(frames[n], hole, INPAINT_PX, cv2.INPAINT_TELEA)
-    unknown = int(missing.sum())
+    from_state, from_first, from_frames = -np.diff(counts)
     return Background(
         frames=frames,
         depth_m=depth,
         hidden=hidden,
         shadow=shadow,
-        from_state=from_state,
-        from_frames=int(hidden.sum()) - from_state - unknown,
-        unknown=unknown,
+        from_state=int(from_state),
+        from_first_frame=int(from_first),
+        from_frames=int(from_frames),
+        unknown=counts[-1],
     )
 
 
@@ -144,7 +181,7 @@ def _neighbors(
     object_ids: Int[np.ndarray, "f h w"],
     hidden: Bool[np.ndarray, "f h w"],
     motions: Mapping[int, np.ndarray],
-) -> _Cloud:
+) -> Cloud:
     """Return the points that some frames show, moved back to the first frame."""
     rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
     points, colors, numbers = [], [], []
@@ -160,7 +197,7 @@ def _neighbors(
         points.append(place)
         colors.append(frames[frame][seen])
         numbers.append(ids)
-    return _Cloud(
+    return Cloud(
         points_m=np.concatenate(points),
         colors=np.concatenate(colors),
         object_ids=np.concatenate(numbers),

@@ -1,7 +1,8 @@
-"""Conversion of an episode with hands to one with robots: video, joint positions and report."""
+"""Conversion of clips with hands to clips with robots: video, joint positions and report."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -13,14 +14,15 @@ from scipy.spatial.transform import Rotation
 
 from egosim_jax.data.lerobot_writer import ClipRecord, EpisodeRecord, write_lerobot
 from egosim_jax.geometry import UP_AXES, up_of
-from egosim_jax.robots.background import Background, moved, remove_hands
+from egosim_jax.robots.background import Background, first_cloud, remove_hands
 from egosim_jax.robots.drawing import Drawn, Shape, draw
 from egosim_jax.robots.models import RobotModel
 from egosim_jax.robots.placement import Base, Placed, place
 from egosim_jax.robots.retarget import Grips, grips_of
+from egosim_jax.robots.sources import Source
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.simulation.start import Start
-from egosim_jax.types import Action, Cameras, InputError, SceneState, near_view
+from egosim_jax.types import Action, Cameras, InputError, SceneState, Triplet, near_view
 
 Hands = Literal["acting", "all"]
 """Hands that get a robot: the one that moves most, or every one; all hands are removed."""
@@ -50,16 +52,21 @@ class Follower:
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Conversion:
-    """An episode with robots in place of hands."""
+    """Clips with robots in place of hands."""
 
-    episode: Episode
-    """Episode with hands."""
+    source: Source
+    """Clips with hands."""
     followers: tuple[Follower, ...]
     """Robots, one for each hand that is followed."""
     backgrounds: tuple[Background, ...]
     """Frames of each clip without hands."""
     drawn: tuple[Drawn, ...]
     """Frames of each clip with robots."""
+
+    @property
+    def episode(self) -> Episode:
+        """Actions and frames with hands."""
+        return self.source.episode
 
     def span(self, clip: int) -> slice:
         """Return the frames of a clip in the tracks; neighbors share a frame."""
@@ -68,21 +75,17 @@ class Conversion:
 
 
 def convert(
-    episode: Episode, robot: RobotModel, *, hands: Hands = "acting", base: Base | None = None
+    source: Source, robot: RobotModel, *, hands: Hands = "acting", base: Base | None = None
 ) -> Conversion:
-    """Return the episode with robots in place of its hands.
+    """Return the clips of a source with robots in place of the hands.
 
-    Raises `InputError` without hands, and without ground truth of depth and ids.
+    Raises `InputError` without hands, and without depth and ids of each pixel.
     """
-    if not episode.ground_truth:
-        raise InputError(
-            "The episode has no ground truth, in whose frames a robot is drawn: make one with it, "
-            "such as egosim episode make --seed 0. (SOURCE)"
-        )
-    backgrounds = _backgrounds(episode)
+    episode = source.episode
     joints = _path([action.joints_m for action in episode.actions])
     eyes = _path([a.cameras.world_from_camera[:, :3, 3] for a in episode.actions])
     chosen = _hands(joints, hands)
+    backgrounds = _backgrounds(source)
     if base is not None and len(chosen) > 1:
         raise InputError("--base places one robot: use it with --hands acting. (--base)")
     world_from_up = up_frame(episode.state, joints[:, chosen])
@@ -93,9 +96,7 @@ def convert(
             robot, grips, world_from_up=world_from_up, eyes_m=eyes, fps=episode.fps, base=base
         )
         followers.append(Follower(robot=robot, hand=hand, grips=grips, placed=placed))
-    found = Conversion(
-        episode=episode, followers=tuple(followers), backgrounds=backgrounds, drawn=()
-    )
+    found = Conversion(source=source, followers=tuple(followers), backgrounds=backgrounds, drawn=())
     return replace(found, drawn=tuple(_drawn(found, world_from_up)))
 
 
@@ -137,12 +138,16 @@ def up_frame(state: SceneState, joints_m: Float[np.ndarray, "f n j 3"]) -> Float
     return pose
 
 
-def _backgrounds(episode: Episode) -> tuple[Background, ...]:
-    state, found = episode.state, []
-    for action, truth in zip(episode.actions, episode.ground_truth, strict=True):
-        found.append(remove_hands(state, action.cameras, truth))
-        state = moved(state, truth.motions or {})
-    return tuple(found)
+def _backgrounds(source: Source) -> tuple[Background, ...]:
+    episode = source.episode
+    image, cameras = episode.first_frame, episode.actions[0].cameras
+    first = None if image is None else first_cloud(image, episode.state, cameras)
+    return tuple(
+        remove_hands(state, action.cameras, truth, first=first, margin_px=source.margin_px)
+        for state, action, truth in zip(
+            source.states, episode.actions, episode.ground_truth, strict=True
+        )
+    )
 
 
 def _drawn(conversion: Conversion, world_from_up: np.ndarray) -> list[Drawn]:
@@ -184,7 +189,7 @@ def video_of(conversion: Conversion) -> UInt8[np.ndarray, "f h w 3"]:
 
 def report_of(conversion: Conversion) -> dict[str, Any]:
     """Return the reached frames and the sources of the pixels behind hands, as JSON."""
-    counts = ("from_state", "from_frames", "unknown", "shadow")
+    counts = ("from_state", "from_first_frame", "from_frames", "unknown", "shadow")
     return {
         "robots": [_report(f, conversion.episode.fps) for f in conversion.followers],
         "hand_pixels": {
@@ -250,6 +255,31 @@ def export(conversion: Conversion, folder: Path) -> None:
         fps=conversion.episode.fps,
         robot_type=conversion.followers[0].robot.arm.name,
     )
+
+
+def triplets_of(conversion: Conversion, name: str) -> Iterator[Triplet]:
+    """Yield the triplet of each clip: the scene before it, the grippers' skeletons, the robots.
+
+    `name` begins the ids of the clips.
+    """
+    from egosim_jax import rendering
+
+    renderer = rendering.get("jax")
+    source, arm = conversion.source, conversion.followers[0].robot.arm
+    for clip, (state, given) in enumerate(zip(source.states, source.episode.actions, strict=True)):
+        action = _skeletons(conversion, clip, given)
+        view = renderer.render(state, action.cameras, point_px=rendering.POINT_PX)
+        hands, _ = renderer.draw_hands(action.joints_m, action.cameras, kind="robot")
+        yield Triplet(
+            video_id=f"{name}_{clip + 1}",
+            prompt=action.prompt,
+            prior=view.frames,
+            mask=view.mask,
+            hands=hands,
+            first_frame=conversion.backgrounds[clip].frames[0],
+            target=conversion.drawn[clip].frames,
+            extra={"split": "train", "kind": "robot", "robot": arm.name},
+        )
 
 
 def rows_of(follower: Follower) -> Float[np.ndarray, "f d"]:

@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 from egosim_jax.cli.__main__ import main
 from egosim_jax.robots.conversion import convert, export, report_of, up_frame, video_of
 from egosim_jax.robots.models import grip_of
+from egosim_jax.robots.sources import of_episode
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.types import InputError, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_episode
@@ -27,7 +28,7 @@ def episode():
 
 @pytest.fixture(scope="module")
 def converted(episode):
-    return convert(episode, make_toy())
+    return convert(of_episode(episode), make_toy())
 
 
 def test_all_clips_have_the_robot_and_no_hand(episode, converted):
@@ -47,7 +48,8 @@ def test_the_report_says_what_is_reached(converted):
     assert robot["speed_in_limits"] <= 1 + 1e-6
     assert robot["least_distance_from_table_m"] > -0.002
     pixels = report["hand_pixels"]
-    assert pixels["from_state"] + pixels["from_frames"] + pixels["unknown"] == pixels["all"]
+    sources = ("from_state", "from_first_frame", "from_frames", "unknown")
+    assert sum(pixels[name] for name in sources) == pixels["all"]
 
 
 def test_the_table_is_found_below_the_hands(episode):
@@ -77,7 +79,7 @@ def test_the_dataset_replays_the_path_of_the_grip(converted, tmp_path):
 def test_an_episode_without_ground_truth_is_refused(episode):
     bare = Episode(state=episode.state, actions=episode.actions, fps=episode.fps)
     with pytest.raises(InputError, match="no ground truth"):
-        convert(bare, make_toy())
+        of_episode(bare)
 
 
 def test_robots_are_listed_and_others_refused(capsys, tmp_path):
