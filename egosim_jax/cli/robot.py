@@ -67,6 +67,7 @@ class Render:
         from egosim_jax.data.sheet import SheetClip, draw_sheet
         from egosim_jax.io.run import write_json
         from egosim_jax.io.video import write_video
+        from egosim_jax.rendering import get
         from egosim_jax.robots.arms import arm_of
         from egosim_jax.robots.conversion import (
             convert,
@@ -93,7 +94,7 @@ class Render:
         draw_sheet([SheetClip(arm.title, rows)], self.out / SHEET, moments=moments)
         export(found, self.out / DATASET)
         name = re.sub("[^A-Za-z0-9_-]+", "_", f"{self.source.resolve().stem}_{arm.name}")
-        write_clips(self.out / TRIPLETS, triplets_of(found, name), fps=episode.fps)
+        write_clips(self.out / TRIPLETS, triplets_of(found, name, get("jax")), fps=episode.fps)
         report = {"source": self.source, "kind": source.kind, **report_of(found)}
         seconds = round(time.monotonic() - began, 1)
         write_json(self.out / REPORT, {**report, "seconds": seconds})

@@ -131,7 +131,8 @@ def remove_hands(
     unclear = hidden | ~np.isfinite(known_m)
     for n in np.flatnonzero(unclear.any(axis=(1, 2))).tolist():
         colors, seen_m, _ = scene.view(cameras, motions, n)
-        fixed = (ids[n] == 0) & (abs(seen_m - depth[n]) < SAME_M) & ~hidden[n]
+        same = np.isfinite(seen_m) & np.isclose(seen_m, depth[n], rtol=0, atol=SAME_M)
+        fixed = same & (ids[n] == 0) & ~hidden[n]
         shaded = fixed & _in_shadow(frames[n], colors, hidden[n])
         shadow += int(shaded.sum())
         take(n, shaded | (hidden[n] & np.isfinite(seen_m)), colors, seen_m)

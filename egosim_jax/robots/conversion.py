@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from egosim_jax.data.lerobot_writer import ClipRecord, EpisodeRecord, write_lerobot
 from egosim_jax.geometry import UP_AXES, up_of
+from egosim_jax.rendering import POINT_PX, Renderer
 from egosim_jax.robots.background import Background, first_cloud, remove_hands
 from egosim_jax.robots.drawing import Drawn, Shape, draw
 from egosim_jax.robots.models import RobotModel
@@ -257,18 +258,15 @@ def export(conversion: Conversion, folder: Path) -> None:
     )
 
 
-def triplets_of(conversion: Conversion, name: str) -> Iterator[Triplet]:
+def triplets_of(conversion: Conversion, name: str, renderer: Renderer) -> Iterator[Triplet]:
     """Yield the triplet of each clip: the scene before it, the grippers' skeletons, the robots.
 
     `name` begins the ids of the clips.
     """
-    from egosim_jax import rendering
-
-    renderer = rendering.get("jax")
     source, arm = conversion.source, conversion.followers[0].robot.arm
     for clip, (state, given) in enumerate(zip(source.states, source.episode.actions, strict=True)):
         action = _skeletons(conversion, clip, given)
-        view = renderer.render(state, action.cameras, point_px=rendering.POINT_PX)
+        view = renderer.render(state, action.cameras, point_px=POINT_PX)
         hands, _ = renderer.draw_hands(action.joints_m, action.cameras, kind="robot")
         yield Triplet(
             video_id=f"{name}_{clip + 1}",

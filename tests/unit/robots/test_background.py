@@ -1,12 +1,14 @@
 """Frames without hands, and robots drawn into them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 pytest.importorskip("mink")
 
 from egosim_jax.geometry import pixel_rays
-from egosim_jax.robots.background import moved, remove_hands
+from egosim_jax.robots.background import first_cloud, moved, remove_hands
 from egosim_jax.robots.drawing import SHADOW, draw
 from egosim_jax.state.depth import state_from_depth
 from egosim_jax.types import Cameras, GroundTruth
@@ -63,6 +65,25 @@ def test_a_hand_is_replaced_by_the_state_with_its_objects_moved(cameras):
     assert (found.frames[2, 9:13, 13:17] == RED).all()
     assert not (found.frames == SKIN).all(axis=-1).any()
     np.testing.assert_allclose(found.depth_m[np.isfinite(found.depth_m)], 1, atol=1e-5)
+
+
+def test_what_the_state_does_not_show_is_taken_from_the_first_frame(cameras):
+    state, clean = scene(cameras)
+    seen = state.points_m[:, 0] < 0.2  # the state ends there
+    part = {name: getattr(state, name)[seen] for name in ("points_m", "colors", "object_ids")}
+    short = replace(state, **part, last_seen=state.last_seen[seen])
+    frames, ids = clean.frames.copy(), clean.object_ids.copy()
+    hand = np.s_[:, 2:6, 26:30]
+    frames[hand], ids[hand] = SKIN, -1
+    unknown = np.full_like(clean.depth_m, np.inf)
+    given = GroundTruth(frames=frames, depth_m=unknown, object_ids=ids, motions=clean.motions)
+    first = first_cloud(clean.frames[0], short, cameras)
+    found = remove_hands(short, cameras, given, first=first)
+    assert found.from_first_frame == found.hidden.sum()
+    assert (found.frames[hand] == GRAY).all()
+    known = np.isfinite(found.depth_m) & (found.depth_m < 2)  # the state's depth
+    np.testing.assert_allclose(found.depth_m[known], 1, atol=1e-5)
+    assert known[:, :, :20].all()
 
 
 def test_the_shadow_of_a_hand_is_removed_and_that_of_others_stays(cameras):

@@ -10,7 +10,17 @@ pytest.importorskip("mink")
 import pyarrow.parquet as pq
 
 from egosim_jax.cli.__main__ import main
-from egosim_jax.robots.conversion import convert, export, report_of, up_frame, video_of
+from egosim_jax.data.clips import check_clip, write_clips
+from egosim_jax.data.metadata import read_metadata
+from egosim_jax.rendering import reference
+from egosim_jax.robots.conversion import (
+    convert,
+    export,
+    report_of,
+    triplets_of,
+    up_frame,
+    video_of,
+)
 from egosim_jax.robots.models import grip_of
 from egosim_jax.robots.sources import of_episode
 from egosim_jax.simulation.episode import Episode
@@ -76,6 +86,19 @@ def test_the_dataset_replays_the_path_of_the_grip(converted, tmp_path):
         np.testing.assert_allclose(grip_of(robot, data)[:3, 3], place, atol=1e-5)
 
 
+def test_the_training_clips_have_the_skeletons_of_the_gripper(converted, tmp_path):
+    path = write_clips(tmp_path, triplets_of(converted, "toy", reference), fps=SPEC.fps)
+    rows = read_metadata(path)
+    assert [(row.video_id, row.extra["robot"]) for row in rows] == [
+        ("toy_1", "toy"),
+        ("toy_2", "toy"),
+    ]
+    assert [check_clip(row, None) for row in rows] == [[], []]
+    for row, triplet in zip(rows, triplets_of(converted, "toy", reference), strict=True):
+        assert np.array_equal(triplet.hands.any(axis=(1, 2, 3)), np.ones(SPEC.frames, bool))
+        assert np.array_equal(triplet.target, converted.drawn[rows.index(row)].frames)
+
+
 def test_an_episode_without_ground_truth_is_refused(episode):
     bare = Episode(state=episode.state, actions=episode.actions, fps=episode.fps)
     with pytest.raises(InputError, match="no ground truth"):
@@ -87,7 +110,8 @@ def test_robots_are_listed_and_others_refused(capsys, tmp_path):
     assert "panda" in capsys.readouterr().out
     given = ["robot", "render", str(tmp_path), "--robot", "r2d2", "--out", str(tmp_path / "out")]
     assert main(given) == 2
-    assert "no robot 'r2d2'" in capsys.readouterr().err
+    assert "no robot 'r2d2'" in (said := capsys.readouterr().err)
+    assert "Did you mean" in said
 
 
 def test_a_missing_extra_is_named(monkeypatch, capsys, episode, tmp_path):
