@@ -18,6 +18,12 @@ from egosim_jax.geometry import pixel_rays, transform
 from egosim_jax.rendering.reference import add_margin, close_gaps, splat
 from egosim_jax.types import Cameras, GroundTruth, InputError, SceneState
 
+EDGE = 1 / 80
+"""Width of the edge of an estimated hand that is hidden, too, in image widths."""
+SLEEVE = 0.15
+"""Width around an estimated hand in which a sleeve may be, in image widths."""
+DIFFERENT = 90
+"""Least difference of a sleeve from the state: sum over the channels, in 8-bit levels."""
 FAR_M = 100.0
 """Assumed depth of the first frame where nothing gives it: a turning camera shows it right."""
 NEIGHBORS = 8
@@ -102,13 +108,13 @@ def remove_hands(
     truth: GroundTruth,
     *,
     first: Cloud | None = None,
-    margin_px: int = 1,
+    estimated: bool = False,
 ) -> Background:
     """Return the frames of a clip without hands, from the state before it and its ground truth.
 
-    `first` has the points of the first frame without hands. `margin_px` is the width of the edge
-    of a hand that is hidden, too. Where the depth is unknown, it is the state's. Raises
-    `InputError` if the ground truth has no depth or ids.
+    `first` has the points of the first frame without hands. Where the depth is unknown, it is the
+    state's. With `estimated` ids, the edge of a hand is wider, and what differs from the state next
+    to a hand is its sleeve. Raises `InputError` if the ground truth has no depth or ids.
     """
     import cv2
 
@@ -118,9 +124,14 @@ def remove_hands(
             "The episode has no depth and ids of its frames, which say what hides the robot: make "
             "one with ground truth, such as egosim episode make --seed 0. (SOURCE)"
         )
-    square = np.ones((2 * margin_px + 1,) * 2, np.uint8)
-    hidden = np.stack([cv2.dilate((m < 0).astype(np.uint8), square) for m in ids]) > 0
+    edge_px = max(2, round(EDGE * cameras.width)) if estimated else 1
+    hidden = np.stack([_dilated(m < 0, edge_px) for m in ids])
     scene = cloud_of(state)
+    if estimated:
+        for n in np.flatnonzero(hidden.any(axis=(1, 2))).tolist():
+            colors, seen_m, _ = scene.view(cameras, motions, n)
+            free = np.isfinite(seen_m) & ~_dilated(ids[n] > 0, edge_px)
+            hidden[n] |= _sleeve(truth.frames[n], colors, hidden[n], free, edge_px)
     frames, depth, missing = truth.frames.copy(), known_m.copy(), hidden.copy()
     shadow, counts = 0, [int(hidden.sum())]
 
@@ -160,6 +171,33 @@ def remove_hands(
         from_frames=int(from_frames),
         unknown=counts[-1],
     )
+
+
+def _dilated(mask: Bool[np.ndarray, "h w"], pixels: int) -> Bool[np.ndarray, "h w"]:
+    import cv2
+
+    square = np.ones((2 * pixels + 1,) * 2, np.uint8)
+    return cv2.dilate(mask.astype(np.uint8), square) > 0
+
+
+def _sleeve(
+    image: UInt8[np.ndarray, "h w 3"],
+    colors: UInt8[np.ndarray, "h w 3"],
+    hand: Bool[np.ndarray, "h w"],
+    free: Bool[np.ndarray, "h w"],
+    edge_px: int,
+) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels connected to a hand that differ from the state, with their edge.
+
+    `free` marks the pixels that the state shows and that no object covers.
+    """
+    import cv2
+
+    change = np.abs(image.astype(int) - colors).sum(axis=-1) > DIFFERENT
+    near = _dilated(hand, round(SLEEVE * image.shape[1]))
+    _, parts = cv2.connectedComponents((hand | (change & near & free)).astype(np.uint8))
+    own = np.isin(parts, np.unique(parts[hand])) & ~hand
+    return _dilated(own, edge_px // 2) & free
 
 
 def _in_shadow(

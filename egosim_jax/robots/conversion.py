@@ -144,7 +144,7 @@ def _backgrounds(source: Source) -> tuple[Background, ...]:
     image, cameras = episode.first_frame, episode.actions[0].cameras
     first = None if image is None else first_cloud(image, episode.state, cameras)
     return tuple(
-        remove_hands(state, action.cameras, truth, first=first, margin_px=source.margin_px)
+        remove_hands(state, action.cameras, truth, first=first, estimated=source.estimated)
         for state, action, truth in zip(
             source.states, episode.actions, episode.ground_truth, strict=True
         )

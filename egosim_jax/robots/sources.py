@@ -20,7 +20,6 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from egosim_jax.annotate.clip import ANNOTATION, MASKS
-from egosim_jax.annotate.scene import PLATE_MARGIN
 from egosim_jax.annotate.to_episode import episode_from
 from egosim_jax.geometry import invert
 from egosim_jax.interactive.server.session import CLOSED, SETTINGS
@@ -50,7 +49,7 @@ KINDS = (
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Source:
-    """Clips with hands, and what is known of each pixel."""
+    """Clips with hands, with depth and ids of each pixel."""
 
     kind: str
     """Kind of the source, for reports."""
@@ -58,8 +57,8 @@ class Source:
     """Actions and frames; the depth, ids and motions are ground truth or estimates."""
     states: tuple[SceneState, ...]
     """Scene before each clip."""
-    margin_px: int = 1
-    """Width of the edge of a hand that is removed with it, in pixels."""
+    estimated: bool = False
+    """True if depth, ids and motions are estimates."""
 
 
 def open_source(path: Path) -> Source:
@@ -223,12 +222,11 @@ def _perceived(
         truths.append(
             GroundTruth(frames=seen, depth_m=known, object_ids=found.object_ids, motions=motions)
         )
-    margin = max(2, round(PLATE_MARGIN * episode.shape[2]))
     return Source(
         kind=kind,
         episode=replace(episode, ground_truth=tuple(truths)),
         states=tuple(before),
-        margin_px=margin,
+        estimated=True,
     )
 
 

@@ -16,6 +16,7 @@ from egosim_jax.worlds.tabletop.primitives import sphere
 
 HEIGHT, WIDTH, FRAMES = 24, 32, 3
 GRAY, RED, SKIN = (120, 120, 120), (200, 40, 40), (216, 150, 118)
+SLEEVE_COLOR = (40, 60, 110)
 BOX = np.s_[8:14, 4:10]
 """Pixels of the object in the first frame; it moves by 8 pixels."""
 SHIFT_PX = 8
@@ -83,7 +84,21 @@ def test_what_the_state_does_not_show_is_taken_from_the_first_frame(cameras):
     assert (found.frames[hand] == GRAY).all()
     known = np.isfinite(found.depth_m) & (found.depth_m < 2)  # the state's depth
     np.testing.assert_allclose(found.depth_m[known], 1, atol=1e-5)
-    assert known[:, :, :20].all()
+    assert known[0, :, :20].all()
+
+
+def test_a_sleeve_next_to_an_estimated_hand_is_removed(cameras):
+    state, clean = scene(cameras)
+    frames, ids = clean.frames.copy(), clean.object_ids.copy()
+    frames[:, 15:22, 18:22], ids[:, 15:22, 18:22] = SKIN, -1
+    frames[:, 15:22, 22:25] = SLEEVE_COLOR
+    frames[:, 2:4, 26:29] = SLEEVE_COLOR  # not at the hand
+    unknown = np.full_like(clean.depth_m, np.inf)
+    given = GroundTruth(frames=frames, depth_m=unknown, object_ids=ids, motions=clean.motions)
+    found = remove_hands(state, cameras, given, estimated=True)
+    assert (found.frames[:, 15:22, 18:25] == GRAY).all()
+    assert (found.frames[:, 2:4, 26:29] == SLEEVE_COLOR).all()
+    assert found.hidden[:, 15:22, 22:25].all()
 
 
 def test_the_shadow_of_a_hand_is_removed_and_that_of_others_stays(cameras):
