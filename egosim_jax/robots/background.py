@@ -139,6 +139,11 @@ def remove_hands(
         frames[n][taken], depth[n][taken] = colors[taken], seen_m[taken]
         missing[n] &= ~taken
 
+    def fill(cloud: Cloud) -> None:
+        for n in np.flatnonzero(missing.any(axis=(1, 2))).tolist():
+            colors, seen_m, _ = cloud.view(cameras, motions, n)
+            take(n, missing[n] & np.isfinite(seen_m), colors, seen_m)
+
     unclear = hidden | ~np.isfinite(known_m)
     for n in np.flatnonzero(unclear.any(axis=(1, 2))).tolist():
         colors, seen_m, _ = scene.view(cameras, motions, n)
@@ -150,12 +155,11 @@ def remove_hands(
         depth[n] = np.where(np.isfinite(depth[n]), depth[n], seen_m)
     counts.append(int(missing.sum()))
     around = _neighbors(cameras, frames, depth, ids, hidden, motions)
-    for cloud in (first, around):
-        left = missing.any(axis=(1, 2)) if cloud is not None else np.zeros(len(frames), bool)
-        for n in np.flatnonzero(left).tolist():
-            colors, seen_m, _ = cloud.view(cameras, motions, n)
-            take(n, missing[n] & np.isfinite(seen_m), colors, seen_m)
-        counts.append(int(missing.sum()))
+    if first is not None:
+        fill(first)
+    counts.append(int(missing.sum()))
+    fill(around)
+    counts.append(int(missing.sum()))
     for n in np.flatnonzero(missing.any(axis=(1, 2))).tolist():
         depth[n][missing[n]] = np.inf
         hole = missing[n].astype(np.uint8)

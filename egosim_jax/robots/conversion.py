@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from egosim_jax.data.lerobot_writer import ClipRecord, EpisodeRecord, write_lerobot
 from egosim_jax.geometry import UP_AXES, up_of
 from egosim_jax.rendering import POINT_PX, Renderer
+from egosim_jax.robots.arms import Arm
 from egosim_jax.robots.background import Background, first_cloud, remove_hands
 from egosim_jax.robots.drawing import Drawn, Shape, draw
 from egosim_jax.robots.models import RobotModel
@@ -68,6 +69,11 @@ class Conversion:
     def episode(self) -> Episode:
         """Actions and frames with hands."""
         return self.source.episode
+
+    @property
+    def arm(self) -> Arm:
+        """Arm of all robots."""
+        return self.followers[0].robot.arm
 
     def span(self, clip: int) -> slice:
         """Return the frames of a clip in the tracks; neighbors share a frame."""
@@ -233,9 +239,8 @@ def export(conversion: Conversion, folder: Path) -> None:
     """Write a LeRobot dataset: joint positions, opening and grip of each robot, and the frames."""
     names, rows = [], []
     for follower in conversion.followers:
-        arm = follower.robot.arm
         prefix = f"{follower.hand}." if len(conversion.followers) > 1 else ""
-        names += [f"{prefix}{name}.pos" for name in arm.joints]
+        names += [f"{prefix}{name}.pos" for name in conversion.arm.joints]
         names += [f"{prefix}gripper.opening_m"]
         names += [f"{prefix}grip.{n}" for n in ("x", "y", "z", "qx", "qy", "qz", "qw")]
         rows.append(rows_of(follower))
@@ -254,7 +259,7 @@ def export(conversion: Conversion, folder: Path) -> None:
         [record],
         names=names,
         fps=conversion.episode.fps,
-        robot_type=conversion.followers[0].robot.arm.name,
+        robot_type=conversion.arm.name,
     )
 
 
@@ -263,7 +268,7 @@ def triplets_of(conversion: Conversion, name: str, renderer: Renderer) -> Iterat
 
     `name` begins the ids of the clips.
     """
-    source, arm = conversion.source, conversion.followers[0].robot.arm
+    source = conversion.source
     for clip, (state, given) in enumerate(zip(source.states, source.episode.actions, strict=True)):
         action = _skeletons(conversion, clip, given)
         view = renderer.render(state, action.cameras, point_px=POINT_PX)
@@ -276,7 +281,7 @@ def triplets_of(conversion: Conversion, name: str, renderer: Renderer) -> Iterat
             hands=hands,
             first_frame=conversion.backgrounds[clip].frames[0],
             target=conversion.drawn[clip].frames,
-            extra={"split": "train", "kind": "robot", "robot": arm.name},
+            extra={"split": "train", "kind": "robot", "robot": conversion.arm.name},
         )
 
 

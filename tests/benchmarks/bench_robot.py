@@ -16,9 +16,10 @@ import argparse
 import resource
 import tempfile
 import time
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
-import mujoco
 import numpy as np
 import pyarrow.parquet as pq
 
@@ -64,6 +65,8 @@ def depth_order(found: Conversion, script: Script) -> float:
 
 def replay_error(found: Conversion, folder: Path) -> float:
     """Return the largest distance in meters between the grips of a dataset and of its joints."""
+    mujoco: Any = import_module("mujoco")
+
     (follower,) = found.followers
     robot, joints = follower.robot, len(follower.robot.arm.joints)
     table = pq.read_table(folder / "data/chunk-000/file-000.parquet")
@@ -79,7 +82,7 @@ def replay_error(found: Conversion, folder: Path) -> float:
 
 def main() -> None:
     """Measure the scenes one by one."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--robot", default="panda")
     parser.add_argument("--scenes", type=int, default=24)
     parser.add_argument("--size", type=int, nargs=4, default=(17, 96, 160, 8))
