@@ -1,6 +1,7 @@
 """An episode of the tabletop world with a toy arm in place of its hand, and its dataset."""
 
 import json
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -103,6 +104,15 @@ def test_an_episode_without_ground_truth_is_refused(episode):
     bare = Episode(state=episode.state, actions=episode.actions, fps=episode.fps)
     with pytest.raises(InputError, match="no ground truth"):
         of_episode(bare)
+
+
+def test_an_episode_without_hands_is_refused(episode):
+    actions = tuple(
+        replace(action, joints_m=np.full_like(action.joints_m, np.nan))
+        for action in episode.actions
+    )
+    with pytest.raises(InputError, match="no hands"):
+        convert(of_episode(replace(episode, actions=actions)), make_toy())
 
 
 def test_robots_are_listed_and_others_refused(capsys, tmp_path):
