@@ -4,6 +4,7 @@ work/ID/            journal and results of finished stages; removed when the cli
 ID/                 the triplet's files, in the layout of `data/metadata.py`
 ID/action.npz       world_from_camera, intrinsics_px and joints_m, which `egosim episode` reads
 ID/depth.npz        depth_m of the first frame, infinite where unknown
+ID/masks.npz        pixels of hands and arms in each frame, for `egosim robot render`
 ID/state            the scene (`state/snapshot.py`)
 ID/annotation.json  choices and measurements, or the reason of a refusal; written last
 """
@@ -40,6 +41,7 @@ from egosim_jax.state import snapshot
 from egosim_jax.types import InputError
 
 ANNOTATION, SHEET, WORK = "annotation.json", "sheet.jpg", "work"
+MASKS = "masks.npz"
 FINAL = ("done", "refused")
 """Statuses of clips that are not annotated again; failed clips are retried."""
 MOMENTS = 6
@@ -212,7 +214,7 @@ def _load(path: Path, *, record: Record, stage: Stage) -> Record:
 def _write(
     job: Job, out: Path, config: AnnotateConfig, record: Record, notes: dict[str, Any]
 ) -> None:
-    """Write the triplet, its cameras, joints, depth and state, and a contact sheet."""
+    """Write the triplet, its cameras, joints, depth, masks and state, and a contact sheet."""
     then = time.monotonic()
     triplet, figures = to_triplet(record, config)
     check_prior(record.require("estimate").verdict.rung, figures, config)
@@ -227,6 +229,8 @@ def _write(
         )
     with atomic_write(folder / "depth.npz") as temporary:
         np.savez(temporary, depth_m=record.require("depth").depth_m[0])
+    with atomic_write(folder / MASKS) as temporary:
+        np.savez_compressed(temporary, hands=record.moving)
     snapshot.save(folder / "state", record.require("state"))
     mask = np.repeat(triplet.mask[..., None], 3, axis=-1)
     videos = {

@@ -26,6 +26,7 @@ from egosim_jax.cli.models import Models
 from egosim_jax.cli.play import Play
 from egosim_jax.cli.preflight import Preflight
 from egosim_jax.cli.rank import Rank
+from egosim_jax.cli.robot import Robot
 from egosim_jax.cli.serve import Serve
 from egosim_jax.cli.simulate import Simulate
 from egosim_jax.cli.table import TableCommand
@@ -44,6 +45,7 @@ Commands = (
     | Annotated[TableCommand, tyro.conf.subcommand("table")]
     | Annotated[Rank, tyro.conf.subcommand("rank")]
     | Annotated[Data, tyro.conf.subcommand("data")]
+    | Annotated[Robot, tyro.conf.subcommand("robot")]
     | Annotated[Models, tyro.conf.subcommand("models")]
     | Annotated[Experiment, tyro.conf.subcommand("experiment")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]

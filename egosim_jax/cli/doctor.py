@@ -32,6 +32,7 @@ EXTRAS = {
     "gymnasium": "env",
     "fastapi": "serve",
     "viser": "play",
+    "mink": "robot",
     "ray": "cluster",
     "rerun": "viewer",
     "OpenEXR": "recorded",

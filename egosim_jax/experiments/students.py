@@ -1,4 +1,4 @@
-"""`egosim experiment students`: a causal student beside its teacher."""
+"""`egosim experiment students`: a causal student and its teacher, compared."""
 
 from __future__ import annotations
 

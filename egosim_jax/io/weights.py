@@ -118,8 +118,8 @@ def hashes(
 ) -> dict[str, str]:
     """Return a hash per network in a weights folder, or per network in `only`.
 
-    Bit-equal weights have the same hash (`weights_hash`). A student beside its teacher counts only
-    with `student`: what the teacher alone makes does not depend on it.
+    Bit-equal weights have the same hash (`weights_hash`). A student in the folder of its teacher
+    counts only with `student`: what the teacher alone makes does not depend on it.
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a weights folder. (--weights)")

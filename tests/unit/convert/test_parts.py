@@ -132,7 +132,7 @@ def test_bit_equal_weights_have_one_hash_whatever_their_file(network, tmp_path):
 
 
 def test_a_student_counts_only_where_it_is_used(tmp_path):
-    """A run of the teacher resumes after a student was put beside it."""
+    """A run of the teacher resumes after a student was put into its folder."""
     ours(tmp_path, "dit")
     teacher = weights.hashes(tmp_path)
     weights.write(tmp_path / weights.STUDENT, {"a.kernel": np.ones((2, 3), np.float16)})

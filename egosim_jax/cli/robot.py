@@ -1,0 +1,126 @@
+"""`egosim robot`: turn clips with hands into clips of robots, with their joint positions."""
+
+from __future__ import annotations
+
+import re
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from egosim_jax.runtime.command import ExitCode
+from egosim_jax.runtime.terminal import make_console
+from egosim_jax.types import InputError
+
+VIDEO, SHEET, REPORT = "robot.mp4", "sheet.jpg", "report.json"
+DATASET, TRIPLETS = "lerobot", "triplets"
+
+
+@dataclass(frozen=True, kw_only=True)
+class List:
+    """List the robots, and what each is good for."""
+
+    def run(self) -> int:
+        """Print the table of robots."""
+        from rich.table import Table
+
+        from egosim_jax.robots.arms import ARMS
+
+        table = Table("name", "robot", "joints", "good for")
+        for arm in ARMS.values():
+            table.add_row(arm.name, arm.title, str(len(arm.joints)), arm.suits)
+        make_console(width=140).print(table)
+        return ExitCode.DONE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Render:
+    """Replace the hands of a clip by robots that follow them (extra `robot`).
+
+    Writes a video, a contact sheet, report.json, a LeRobot dataset (version 3.0) with joint
+    positions, and training clips with the gripper's skeleton. The report names the frames that the
+    robot does not reach, and by how much.
+    """
+
+    source: Annotated[Path, tyro.conf.Positional]
+    """Clip with known hands and cameras, recognized by its files.
+
+    An episode with ground truth (`egosim episode make`), a clip of `egosim data annotate`, a run of
+    `egosim simulate`, or a session of `egosim serve` or `egosim play`."""
+    robot: str
+    """Name in `egosim robot list`."""
+    out: Path
+    """Folder to write, new or empty."""
+    hands: Literal["acting", "all"] = "acting"
+    """Hands that get a robot: the one that moves most, or each. All hands are removed."""
+    base: tuple[float, float, float, float] | None = None
+    """Place of the robot's base, x, y and z in meters above the table, and its yaw in degrees.
+
+    By default a place is searched from which the whole path can be reached."""
+
+    def run(self) -> int:
+        """Convert the episode and write everything."""
+        from egosim_jax.data.clips import write_clips
+        from egosim_jax.data.lerobot_writer import check_new
+        from egosim_jax.data.sheet import SheetClip, draw_sheet
+        from egosim_jax.io.run import write_json
+        from egosim_jax.io.video import write_video
+        from egosim_jax.rendering import get
+        from egosim_jax.robots.arms import arm_of
+        from egosim_jax.robots.conversion import (
+            convert,
+            export,
+            report_of,
+            triplets_of,
+            video_of,
+        )
+        from egosim_jax.robots.models import load_model
+        from egosim_jax.robots.sources import open_source
+
+        arm = arm_of(self.robot)
+        check_new(self.out)
+        robot = load_model(arm)
+        began = time.monotonic()
+        source = open_source(self.source)
+        episode = source.episode
+        found = convert(source, robot, hands=self.hands, base=self.base)
+        self.out.mkdir(parents=True, exist_ok=True)
+        write_video(self.out / VIDEO, video_of(found), episode.fps)
+        first, truth = found.drawn[0], episode.ground_truth[0]
+        rows = [truth.frames, found.backgrounds[0].frames, first.frames]
+        moments = [round(n * (len(truth.frames) - 1) / 5) for n in range(6)]
+        draw_sheet([SheetClip(arm.title, rows)], self.out / SHEET, moments=moments)
+        export(found, self.out / DATASET)
+        name = re.sub("[^A-Za-z0-9_-]+", "_", f"{self.source.resolve().stem}_{arm.name}")
+        write_clips(self.out / TRIPLETS, triplets_of(found, name, get("jax")), fps=episode.fps)
+        report = {"source": self.source, "kind": source.kind, **report_of(found)}
+        seconds = round(time.monotonic() - began, 1)
+        write_json(self.out / REPORT, {**report, "seconds": seconds})
+        for entry in report["robots"]:
+            print(
+                f"{entry['robot']} reaches {entry['reached']:.1%} of {entry['frames']} frames, "
+                f"{1000 * entry['pinch_error_m']['max']:.1f} mm off at most"
+            )
+        if not any(entry["reached"] for entry in report["robots"]):
+            raise InputError(
+                f"{arm.title} reaches the hand in no frame: see {self.out / REPORT}. Use another "
+                "robot or base. (--robot, --base)"
+            )
+        print(self.out)
+        return ExitCode.DONE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Robot:
+    """Turn clips with hands into clips of robots, with their joint positions."""
+
+    command: (
+        Annotated[Render, tyro.conf.subcommand("render")]
+        | Annotated[List, tyro.conf.subcommand("list")]
+    )
+
+    def run(self) -> int:
+        """Run the chosen command."""
+        return self.command.run()

@@ -1,0 +1,1 @@
+"""Robots in place of hands: retargeting, inverse kinematics and rendering in a clip's camera."""

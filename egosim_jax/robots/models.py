@@ -1,0 +1,203 @@
+"""MuJoCo models of arms: loading, and the positions of a gripper's joints by its opening.
+
+The arm is at the origin of its base frame, z upwards. The table is a plane below it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any, no_type_check
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from egosim_jax.robots.arms import Arm, Gripper
+from egosim_jax.types import InputError
+
+TABLE = "table of egosim"
+"""Name of the plane of the table."""
+GRIP = "grip of egosim"
+"""Name of the site at the grip (`retarget.py`)."""
+MOUNTED = "mounted/"
+"""Prefix of the names of a gripper that is attached to the arm."""
+OPENINGS = 33
+"""Number of positions of the gripper in its table."""
+
+
+@no_type_check
+@dataclass(frozen=True, kw_only=True)
+class RobotModel:
+    """Compiled model of an arm, and what its gripper does."""
+
+    arm: Arm
+    """Arm of the model."""
+    mj: Any
+    """MuJoCo's model (MjModel)."""
+    joint_at: Int[np.ndarray, " j"]
+    """Index of each arm joint's position in `qpos`."""
+    gripper_at: Int[np.ndarray, " k"]
+    """Index of the position of each joint of the gripper in `qpos`."""
+    gripper_dofs: Int[np.ndarray, " k"]
+    """Index of the velocity of each joint of the gripper."""
+    site: int
+    """Number of the site at the grip."""
+    openings_m: Float[np.ndarray, " n"]
+    """Openings in the table of the gripper, ascending from 0."""
+    positions: Float[np.ndarray, "n k"]
+    """Positions of the gripper's joints at each opening."""
+    grips_m: Float[np.ndarray, "n 3"]
+    """Place of the grip, in the frame of the gripper's body, at each opening."""
+
+    @property
+    def home(self) -> Float[np.ndarray, " q"]:
+        """Positions of all joints with the arm at home and the gripper open."""
+        q = self.mj.qpos0.copy()
+        q[self.joint_at], q[self.gripper_at] = self.arm.home, self.positions[-1]
+        return q
+
+    def open(self, q: np.ndarray, opening_m: float) -> Float[np.ndarray, " q"]:
+        """Return the positions of all joints with the gripper at an opening; move the site."""
+        q = q.copy()
+        q[self.gripper_at] = _between(self.openings_m, self.positions, opening_m)
+        self.mj.site_pos[self.site] = _between(self.openings_m, self.grips_m, opening_m)
+        return q
+
+
+def check_installed() -> None:
+    """Raise `InputError` unless the packages of the extra `robot` are installed."""
+    if missing := [name for name in ("mujoco", "mujoco_menagerie", "mink") if not find_spec(name)]:
+        raise InputError(
+            f"Robots need {', '.join(missing)}, which is not installed: pip install "
+            "'egosim-jax[robot]'."
+        )
+
+
+def load_model(arm: Arm) -> RobotModel:
+    """Return the model of an arm from the Menagerie, which is downloaded on first use."""
+    check_installed()
+    spec = _spec(arm.model)
+    if arm.gripper.model is not None:
+        gripper = _spec(arm.gripper.model)
+        gripper.option.impratio, gripper.option.cone = spec.option.impratio, spec.option.cone
+        site = next(site for site in spec.sites if site.name == arm.mount)
+        spec.attach(gripper, prefix=MOUNTED, site=site)
+    return make_model(arm, spec)
+
+
+def _spec(model: tuple[str, str]) -> Any:
+    import mujoco_menagerie
+
+    folder, name = model
+    try:
+        return mujoco_menagerie.get(folder).spec(name)
+    except mujoco_menagerie.MenagerieError as error:
+        raise InputError(
+            f"The model {folder} of the MuJoCo Menagerie cannot be had: {error} Connect to the "
+            "network once, or set MENAGERIE_ROOT to a checkout of the Menagerie."
+        ) from error
+
+
+def make_model(arm: Arm, spec: Any) -> RobotModel:
+    """Return the model of an arm from its specification, with a plane for the table."""
+    mujoco: Any = import_module("mujoco")
+
+    prefix = MOUNTED if arm.gripper.model else ""
+    for key in list(spec.keys):
+        spec.delete(key)  # their sizes do not fit a mounted gripper
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    spec.worldbody.add_geom(name=TABLE, type=plane, size=[2, 2, 0.1], group=5)
+    spec.body(prefix + arm.gripper.body).add_site(name=GRIP, group=5)
+    mj = spec.compile()
+    mj.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    joints = [mj.joint(name) for name in arm.joints]
+    gripper = [j for j in map(mj.joint, range(mj.njnt)) if j.name not in arm.joints]
+    openings, positions, grips = _sweep(mj, arm.gripper, prefix, gripper)
+    site = mj.site(GRIP).id
+    # The compiler marks frames at the origin of its body, and MuJoCo then ignores its own pose.
+    mj.site_sameframe[site] = mj.geom_sameframe[mj.geom(TABLE).id] = 0
+    mujoco.mju_mat2Quat(mj.site_quat[site], grips[-1, :3, :3].ravel())
+    return RobotModel(
+        arm=arm,
+        mj=mj,
+        joint_at=np.array([j.qposadr[0] for j in joints]),
+        gripper_at=np.array([j.qposadr[0] for j in gripper]),
+        gripper_dofs=np.array([j.dofadr[0] for j in gripper]),
+        site=site,
+        openings_m=openings,
+        positions=positions,
+        grips_m=grips[:, :3, 3],
+    )
+
+
+def _sweep(
+    mj: Any, gripper: Gripper, prefix: str, joints: list[Any]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return opening, joint positions and grip while the driver moves from closed to open."""
+    mujoco: Any = import_module("mujoco")
+
+    data = mujoco.MjData(mj)
+    driver = mj.joint(prefix + gripper.driver)
+    at = np.array([j.qposadr[0] for j in joints])
+    others = [j for j in joints if j.id != driver.id]
+    free, follow = (np.array([getattr(j, n)[0] for j in others]) for n in ("dofadr", "qposadr"))
+    gaps, positions, grips = [], [], []
+    for value in np.linspace(gripper.open, gripper.closed, OPENINGS):
+        data.qpos[driver.qposadr[0]] = value
+        _close_loops(mj, data, free, follow)
+        body = _pose(data.body(prefix + gripper.body))
+        tips = [_point(data.body(prefix + name), point) for name, point in gripper.tips]
+        first, second = ((tip - body[:3, 3]) @ body[:3, :3] for tip in tips)
+        grips.append(_grip(first, second, np.array(gripper.approach, float)))
+        gaps.append((second - first) @ grips[0][:3, 0])
+        positions.append(data.qpos[at])
+    gaps = np.array(gaps) - gaps[-1]
+    order = np.argsort(gaps)
+    return gaps[order], np.array(positions)[order], np.array(grips)[order]
+
+
+def _close_loops(mj: Any, data: Any, free: np.ndarray, follow: np.ndarray) -> None:
+    """Move the joints that follow the driver until the model's equalities hold (Gauss-Newton)."""
+    mujoco: Any = import_module("mujoco")
+
+    for _ in range(30):
+        mujoco.mj_fwdPosition(mj, data)
+        if not (data.ne and len(free)) or np.abs(data.efc_pos[: data.ne]).max() < 1e-7:
+            return
+        rows = data.efc_J.reshape(data.nefc, mj.nv)[: data.ne, free]
+        step = np.linalg.lstsq(rows, data.efc_pos[: data.ne], rcond=1e-6)[0]
+        data.qpos[follow] -= np.clip(step, -0.2, 0.2)
+
+
+def _grip(first: np.ndarray, second: np.ndarray, approach: np.ndarray) -> np.ndarray:
+    """Return the grip's pose from both tips, in the frame of the body."""
+    across = second - first
+    across = across - (across @ approach) * approach
+    across /= max(float(np.linalg.norm(across)), 1e-9)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([across, np.cross(approach, across), approach], axis=1)
+    pose[:3, 3] = (first + second) / 2
+    return pose
+
+
+def _point(body: Any, point: tuple[float, float, float]) -> np.ndarray:
+    return body.xpos + body.xmat.reshape(3, 3) @ np.array(point, float)
+
+
+def _pose(body: Any) -> Float[np.ndarray, "4 4"]:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = body.xmat.reshape(3, 3), body.xpos
+    return pose
+
+
+def _between(openings: np.ndarray, values: np.ndarray, opening_m: float) -> np.ndarray:
+    return np.array([np.interp(opening_m, openings, column) for column in values.T])
+
+
+def grip_of(robot: RobotModel, data: Any) -> Float[np.ndarray, "4 4"]:
+    """Return the pose of the grip in the base frame."""
+    pose = np.eye(4)
+    pose[:3, :3] = data.site_xmat[robot.site].reshape(3, 3)
+    pose[:3, 3] = data.site_xpos[robot.site]
+    return pose

@@ -1,0 +1,113 @@
+"""Grips of hands, the gripper's table, and the motion of an arm along a path."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mink")
+
+from egosim_jax.robots.ik import Solver
+from egosim_jax.robots.models import GRIP
+from egosim_jax.robots.placement import place
+from egosim_jax.robots.retarget import grips_of
+from tests.unit.robots.toy import TOY, make_toy
+
+FPS, FRAMES = 8, 9
+DOWN = np.diag([1.0, -1.0, -1.0])
+"""Axes of a grip from above."""
+
+
+@pytest.fixture(scope="module")
+def toy():
+    return make_toy()
+
+
+def path_to(*places_m):
+    """Return grips from above, along straight lines."""
+    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
+    poses[:, :3, :3] = DOWN
+    knots = np.linspace(0, 1, len(places_m))
+    for axis, values in enumerate(np.transpose(places_m)):
+        poses[:, axis, 3] = np.interp(np.linspace(0, 1, FRAMES), knots, values)
+    return poses
+
+
+def gripper(poses, opening_m):
+    """Return the three keypoints of grips."""
+    tip = poses[:, :3, 0] * opening_m / 2
+    place = poses[:, :3, 3]
+    return np.stack([place - 0.12 * poses[:, :3, 2], place - tip, place + tip], axis=1)
+
+
+def follow(toy, poses, table_m=0.0):
+    solver, openings = Solver(toy, table_m=table_m), np.full(FRAMES, 0.05)
+    start = solver.approach(toy.home, poses[0], 0.05, steps=60)
+    return solver.follow(start, poses, openings, fps=FPS)
+
+
+def test_a_grip_has_the_pose_of_its_keypoints():
+    poses = path_to([0.3, 0.1, 0.2], [0.3, 0.1, 0.2])
+    grips = grips_of(gripper(poses, 0.06), fps=FPS)
+    np.testing.assert_allclose(grips.world_from_grip, poses, atol=1e-9)
+    np.testing.assert_allclose(grips.opening_m, 0.06)
+
+
+def test_a_missing_hand_stays_where_it_was_seen_last():
+    joints = gripper(path_to([0.3, 0, 0.2], [0.4, 0, 0.2]), 0.06)
+    joints[4:6] = np.nan
+    grips = grips_of(joints, fps=FPS)
+    assert grips.seen.tolist() == [True] * 4 + [False] * 2 + [True] * 3
+    np.testing.assert_array_equal(grips.world_from_grip[4], grips.world_from_grip[3])
+    assert np.isnan(grips.pinch_m[4:6]).all()
+
+
+def test_a_closed_grip_keeps_its_direction():
+    joints = gripper(path_to([0.3, 0, 0.2], [0.3, 0, 0.2]), 0.06)
+    joints[3:, 1:] = joints[3:, 1:].mean(axis=1, keepdims=True)
+    turns = grips_of(joints, fps=FPS).world_from_grip[:, :3, :3]
+    np.testing.assert_allclose(turns, np.broadcast_to(DOWN, turns.shape), atol=1e-9)
+
+
+def test_the_table_of_a_gripper_follows_its_equality(toy):
+    np.testing.assert_allclose(toy.openings_m[[0, -1]], [0, 0.08], atol=1e-9)
+    np.testing.assert_allclose(toy.positions[:, 0], toy.positions[:, 1], atol=1e-7)
+    q = toy.open(toy.home, 0.03)
+    np.testing.assert_allclose(q[toy.gripper_at], 0.015, atol=1e-7)
+    np.testing.assert_allclose(toy.mj.site(GRIP).pos, [0, 0, 0.075], atol=1e-9)
+
+
+def test_a_path_within_reach_is_followed_within_the_limits(toy):
+    track = follow(toy, path_to([0.35, -0.1, 0.2], [0.35, 0.1, 0.1], [0.3, 0.1, 0.2]))
+    assert track.error_m.max() < 5e-4
+    assert track.turn_error.max() < np.radians(2)
+    joints = track.q[:, toy.joint_at]
+    low, high = np.array([toy.mj.joint(name).range for name in TOY.joints]).T
+    assert (joints > low).all()
+    assert (joints < high).all()
+    assert (np.abs(np.diff(joints, axis=0)) * FPS <= np.array(TOY.speeds) * (1 + 1e-6)).all()
+    assert track.clearance_m.min() > 0
+
+
+def test_a_path_out_of_reach_says_by_how_much(toy):
+    track = follow(toy, path_to([0.35, 0, 0.2], [0.95, 0, 0.2]))
+    assert track.reached[0]
+    assert not track.reached[-1]
+    assert 0.15 < track.error_m[-1] < 0.45
+
+
+def test_the_table_stops_the_gripper(toy):
+    track = follow(toy, path_to([0.35, 0, 0.2], [0.35, 0, -0.05]))
+    assert track.clearance_m.min() > -0.002
+    assert not track.reached[-1]
+    assert track.error_m[-1] == pytest.approx(0.06, abs=0.02)
+
+
+def test_a_base_is_found_from_which_the_whole_path_is_reached(toy):
+    poses = path_to([0.1, 0.3, 0.15], [-0.1, 0.3, 0.05], [0.0, 0.2, 0.15])
+    grips = grips_of(gripper(poses, 0.06), fps=FPS)
+    eyes = np.tile([0.0, -0.2, 0.5], (FRAMES, 1))
+    placed = place(toy, grips, world_from_up=np.eye(4), eyes_m=eyes, fps=FPS)
+    assert placed.track.reached.all()
+    base = (*placed.world_from_base[:2, 3], 0.0, 0.0)
+    given = place(toy, grips, world_from_up=np.eye(4), eyes_m=eyes, fps=FPS, base=base)
+    np.testing.assert_allclose(given.world_from_base[:3, 3], base[:3])
+    np.testing.assert_allclose(given.world_from_base[:3, :3], np.eye(3))
