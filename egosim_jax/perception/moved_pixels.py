@@ -152,7 +152,7 @@ def _cleaned(
     own = cv2.morphologyEx(own, cv2.MORPH_OPEN, kernel)
     own = cv2.morphologyEx(own, cv2.MORPH_CLOSE, kernel, iterations=2)
     own = _at_corners(own, start)
-    # Notches: where the object has the color of what is behind it, nothing shows that it moves.
+    # Notches: where the object has the color of the background, nothing shows that it moves.
     size = round(NOTCH * np.ptp(np.argwhere(own), axis=0).max()) | 1 if own.any() else 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     around = np.pad(own, size)
