@@ -20,6 +20,8 @@ MIN_LIFT_M = 0.01
 """Minimum height of a release above the first height, in meters; below it nothing falls."""
 FOOTPRINT_M = 0.006
 """Horizontal distance within which the state's points are below an object, in meters."""
+MIN_SUPPORT = 20
+"""Minimum number of points of a surface below an object; fewer may be its own, left out of it."""
 SNAP_M = 0.02
 """Maximum height error of a released object, above or below its support, in meters."""
 
@@ -98,6 +100,5 @@ def _clearance(
         others_m[below] @ level, distance_upper_bound=FOOTPRINT_M
     )
     support = others[below][np.isfinite(near)]
-    return float(
-        np.quantile(heights, 0.02) - (np.quantile(support, 0.95) if len(support) else floor)
-    )
+    is_surface = len(support) >= MIN_SUPPORT
+    return float(np.quantile(heights, 0.02) - (np.quantile(support, 0.95) if is_surface else floor))

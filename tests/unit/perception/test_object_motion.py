@@ -140,6 +140,14 @@ def test_what_was_put_down_has_its_first_height_above_the_support(end_m, height_
     np.testing.assert_array_equal(path[:5], carried(end_m).path[:5])
 
 
+def test_points_of_the_object_that_were_left_out_do_not_support_it():
+    """A ball without an id lacks the points of its underside, which no table point is below."""
+    crumbs = np.array([[0.0, 0.0, 0.709], [0.002, 0.0, 0.709]])
+    others = np.concatenate([TOP[np.abs(TOP[:, 1]) > 0.05], BLOCK, crumbs]).astype(np.float32)
+    path = snap(carried([0.3, 0, 0.103]), others).path
+    np.testing.assert_allclose(path[-1, :3, 3], [0.3, 0, 0.1], atol=1e-6)
+
+
 @pytest.mark.parametrize("rise_m", [0.002, -0.003])
 def test_a_drawer_that_slides_out_of_its_case_keeps_its_height(rise_m):
     """Its case, and not what it rests on, is below it at first; later it is above the table."""
