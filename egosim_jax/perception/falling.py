@@ -21,7 +21,7 @@ MIN_LIFT_M = 0.01
 FOOTPRINT_M = 0.006
 """Horizontal distance within which the state's points are below an object, in meters."""
 MIN_SUPPORT = 20
-"""Minimum number of points of a surface below an object; fewer may be its own, left out of it."""
+"""Minimum number of points of a surface below an object; fewer may be its own, which it lacks."""
 SNAP_M = 0.02
 """Maximum height error of a released object, above or below its support, in meters."""
 

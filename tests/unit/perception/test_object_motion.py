@@ -140,7 +140,7 @@ def test_what_was_put_down_has_its_first_height_above_the_support(end_m, height_
     np.testing.assert_array_equal(path[:5], carried(end_m).path[:5])
 
 
-def test_points_of_the_object_that_were_left_out_do_not_support_it():
+def test_the_objects_own_missing_points_do_not_support_it():
     """A ball without an id lacks the points of its underside, which no table point is below."""
     crumbs = np.array([[0.0, 0.0, 0.709], [0.002, 0.0, 0.709]])
     others = np.concatenate([TOP[np.abs(TOP[:, 1]) > 0.05], BLOCK, crumbs]).astype(np.float32)
