@@ -227,11 +227,10 @@ def predicted_costs(
         left = (rest == len(points)) & ~nearer
         guessed = left
         if not is_whole:
-            guessed = dilate(left, 0.0)
-            known &= ~guessed
-            passed = _passed(motion, frames, local) & on_support[rest] & ~nearer
+            edge = dilate(left, 0.0)
+            known &= ~edge
             gaps = np.where(left, UNKNOWN, gaps)
-            guessed = guessed | passed
+            guessed = edge | (_passed(motion, frames, local) & on_support[rest] & ~nearer)
         gaps = np.where(guessed, np.minimum(gaps, UNKNOWN), gaps)
         gaps = np.where(left & stayed & (gaps >= UNKNOWN), STAYED, gaps)
         found.append(np.minimum(gaps, color.max_residual))

@@ -35,7 +35,7 @@ def fall(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"], fps: int) -
     if not motion.lands:
         return motion
     up, gap = _gap_below(motion, others_m)
-    if _rise(motion, motion.released, up) < MIN_LIFT_M:
+    if _rises(motion, up)[motion.released] < MIN_LIFT_M:
         return motion
     seconds = np.maximum(np.arange(len(motion.path)) - motion.released, 0) / fps
     drop = np.minimum(GRAVITY / 2 * seconds**2, max(gap, 0.0))
@@ -55,8 +55,9 @@ def snap(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"]) -> ObjectMo
     if not motion.lands:
         return motion
     up, gap = _gap_below(motion, others_m)
-    if max(_rise(motion, frame, up) for frame in range(len(motion.path))) < MIN_LIFT_M:
-        gap = min(gap, _rise(motion, -1, up), key=abs)
+    rises = _rises(motion, up)
+    if rises.max() < MIN_LIFT_M:
+        gap = min(gap, float(rises[-1]), key=abs)
     if abs(gap) > SNAP_M:
         return motion
     path = motion.path.copy()
@@ -78,10 +79,10 @@ def _gap_below(
     return up, _clearance(end, others_m, up, floor) - _clearance(first, under, up, floor)
 
 
-def _rise(motion: ObjectMotion, frame: int, up: Float[np.ndarray, " 3"]) -> float:
-    """Return how much higher than at first an object is in a frame, in meters."""
-    first = motion.model.points_m
-    return float(((transform(motion.path[frame], first) - first) @ up).mean())
+def _rises(motion: ObjectMotion, up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " f"]:
+    """Return how much higher than at first an object's center is in each frame, in meters."""
+    center = motion.model.points_m.mean(axis=0, keepdims=True)
+    return (transform(motion.path, center) - center)[:, 0] @ up
 
 
 def _clearance(
