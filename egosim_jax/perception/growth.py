@@ -362,10 +362,14 @@ def clusters_without_id(
     The growths of a cluster begin with the largest. The note says why a hand that surely held
     something has no growth.
     """
+    from scipy.spatial import KDTree
+
     pinches = grip.tips_m[grip.grasps].mean(axis=1)
-    free = np.flatnonzero(state.object_ids == 0)
-    gaps = [np.linalg.norm(state.points_m[free] - pinch, axis=1) for pinch in pinches]
-    free = free[np.min(gaps, axis=0) <= config.max_extent_m]
+    low, high = pinches.min(axis=0) - config.max_extent_m, pinches.max(axis=0) + config.max_extent_m
+    within = ((state.points_m >= low) & (state.points_m <= high)).all(axis=1)
+    free = np.flatnonzero((state.object_ids == 0) & within)
+    gaps, _ = KDTree(pinches).query(state.points_m[free])
+    free = free[gaps <= config.max_extent_m]
     if len(free) < config.min_points:
         return [], "closed on nothing" if grip.sure else ""
     around = Surroundings.of(state, free, cameras.world_from_camera[0], config)

@@ -10,6 +10,7 @@ pixel shows the shape that its ray meets first, without shading.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
@@ -44,6 +45,7 @@ def splat(
     depth, index = np.full(shape, np.inf, np.float32), np.full(shape, -1)
     (known,) = np.nonzero(np.isfinite(points_m).all(axis=1))
     points, focal = points_m[known].astype(float), cameras.intrinsics_px.astype(np.float32)
+    rows, columns = (size + point_px - 1 for size in shape[1:])
     for frame, world_from_camera in enumerate(cameras.world_from_camera):
         local = transform(invert(world_from_camera), points).astype(np.float32)
         drawable = (local[:, 2] >= NEAR_M) & (local[:, 2] <= FAR_M)
@@ -51,14 +53,14 @@ def splat(
         u, v = project(focal, local)
         # One key for depth and number: the bits of positive floats sort as the floats do.
         keys = local[:, 2].copy().view(np.uint32).astype(np.uint64) << 32 | number
-        column, row = (np.ceil(x - point_px / 2).astype(int) for x in (u, v))
-        best = np.full(shape[1] * shape[2], NO_POINT)
-        for down in range(point_px):
-            for right in range(point_px):
-                y, x = row + down, column + right
-                inside = (y >= 0) & (y < shape[1]) & (x >= 0) & (x < shape[2])
-                np.minimum.at(best, y[inside] * shape[2] + x[inside], keys[inside])
-        best = best.reshape(shape[1:])
+        # The nearest point whose square begins at a pixel, then the nearest of the squares over it.
+        column, row = (np.ceil(x - point_px / 2).astype(int) + point_px - 1 for x in (u, v))
+        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+        best = np.full(rows * columns, NO_POINT)
+        np.minimum.at(best, row[inside] * columns + column[inside], keys[inside])
+        best = best.reshape(rows, columns)
+        best = reduce(np.minimum, [best[y : y + shape[1]] for y in range(point_px)])
+        best = reduce(np.minimum, [best[:, x : x + shape[2]] for x in range(point_px)])
         drawn = best != NO_POINT
         depth[frame][drawn] = (best[drawn] >> 32).astype(np.uint32).view(np.float32)
         index[frame][drawn] = (best[drawn] & 0xFFFFFFFF).astype(int)
