@@ -95,9 +95,10 @@ class Students(ModelExperiment):
     """Compare a causal student with its teacher on held-out scenes, and over consecutive clips.
 
     The rows: the teacher with several numbers of denoising steps, its weights used chunk by chunk,
-    the given stages of training, and the student. Prints means, the student's differences from each
-    row, and the clips of the loop with `classical` updates. Writes report.json, curves.png and
-    contact_sheet.png. The same command resumes the loop.
+    the given stages of training, the student with other numbers of steps, and as it is. Prints
+    means, the student's differences from each row, and the clips of the loop with `classical`
+    updates. Writes report.json, curves.png and contact_sheet.png. The same command resumes the
+    loop.
     """
 
     config: str = "tabletop_student"
@@ -106,6 +107,8 @@ class Students(ModelExperiment):
     """Name of the teacher, whose weights are in the student's folder."""
     teacher_steps: tuple[int, ...] = (2, 4, 10)
     """Denoising steps of the teacher, a row for each."""
+    student_steps: tuple[int, ...] = (2,)
+    """Other denoising steps of the student, a row for each."""
     stages: tuple[str, ...] = ()
     """Stages of the student's training, each as NAME=FILE; the file is a run's lora.safetensors."""
     scenes: int = 24

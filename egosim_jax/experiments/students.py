@@ -55,8 +55,9 @@ def run(settings: Students) -> None:
     """Generate the scenes by each denoiser, simulate the sequences, and compare."""
     counts = {"--scenes": settings.scenes, "--batch-size": settings.batch_size}
     check_counts({**counts, "--clips": settings.clips})
-    for steps in settings.teacher_steps:
-        check_counts({"--teacher-steps": steps})
+    for option in ("--teacher-steps", "--student-steps"):
+        for steps in getattr(settings, option[2:].replace("-", "_")):
+            check_counts({option: steps})
     stages = [_stage(text) for text in settings.stages]
     student = settings.open()
     chunks_of(student.config)  # raises for a config without chunks
@@ -99,6 +100,11 @@ def _others(
             chunks = replace(chunks_of(student.config), refresh=refresh)
             config = replace(student.config, chunks=chunks)
             yield f"{name}, refreshed" if refresh else name, Generator(config, networks)
+    networks = Networks.load(student.config, folder)
+    for steps in settings.student_steps:
+        chunks = replace(chunks_of(student.config), first_steps=steps)
+        config = replace(student.config, steps=steps, chunks=chunks)
+        yield f"{STUDENT}, {steps} steps", Generator(config, networks)
 
 
 def _compare_clips(settings: Students, student: Generator, others: Iterator[Row]) -> dict:
