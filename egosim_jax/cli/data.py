@@ -144,8 +144,8 @@ class Encode:
     """Folder of shards of videos or frames, with targets."""
     out: Path
     """Folder of the latents shards."""
-    stride: int = 1
-    """Frames between the windows of a clip."""
+    stride: int | None = None
+    """Frames between the windows of a clip; by default a window's frames, without overlap."""
     batch_size: int | None = None
     """Windows per batch of a process: a multiple of its devices; by default one per device."""
     shard_windows: int = 64
@@ -168,15 +168,16 @@ class Encode:
         from egosim_jax.types import MeshConfig
 
         share_with_jax()
+        config = configs.get(self.config).at(self.weights)
         source = ShardReader(self.shards)
         with launched_context():
             mesh = make_mesh(MeshConfig(data=-1, fsdp=1), jax.local_devices())
             skipped = encode_shards(
-                configs.get(self.config).at(self.weights),
+                config,
                 self.weights,
                 source=source,
                 out=self.out,
-                stride=self.stride,
+                stride=config.video.frames if self.stride is None else self.stride,
                 batch_size=mesh.size if self.batch_size is None else self.batch_size,
                 mesh=mesh,
                 shard_windows=self.shard_windows,

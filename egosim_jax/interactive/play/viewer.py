@@ -138,7 +138,8 @@ class Page:
             gui.add_image(_large(blank.astype(np.uint8)), label=label, jpeg_quality=90)
             for label in ("Generated", "Ground truth")
         ]
-        self._status = gui.add_markdown(HELP)
+        gui.add_markdown(HELP)
+        self._status = gui.add_markdown("")
         with gui.add_folder("Act"):
             self._object: viser.GuiDropdownHandle[str] = gui.add_dropdown("Object", NOTHING)
             acts = {label: partial(self._interact, act) for label, act in INTERACTIONS}
@@ -262,7 +263,7 @@ class Page:
         if played.goal is not None:
             self._object.value, place = played.goal
             self._ring.position = (*place, 0.0)
-        self._status.content = HELP
+        self._status.content = ""
         self._refresh()
 
     def _refresh(self) -> None:
