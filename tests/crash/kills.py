@@ -33,7 +33,8 @@ TIMED = ("step_time_s", "chain", "data_wait_frac", "tflops", "mfu", "peak_mem_gb
 MODEL = "--config debug --weights ../weights"
 OF_A_CLIP = "--frames 9 --height 64 --width 96 --fps 16 --workers 1"
 MAKE = f"egosim_jax.cli data make tabletop --scenes 3 {OF_A_CLIP}"
-ENCODE = f"egosim_jax.cli data encode {MODEL} --shards ../frames --shard-windows 1 --batch-size 1"
+OF_AN_ENCODING = "--shard-windows 1 --batch-size 1 --stride 1"
+ENCODE = f"egosim_jax.cli data encode {MODEL} --shards ../frames {OF_AN_ENCODING}"
 COMMANDS = {
     "simulate": f"egosim_jax.cli simulate {MODEL} --clips 2 --perception oracle",
     "generate": f"egosim_jax.cli generate {MODEL} --limit 2 --skip-existing",

@@ -36,7 +36,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         make += f"--width 96 --fps 16 --workers 1 --out {folder / split}"
         assert egosim(make.split()) == 0
         encode = f"data encode --config debug --weights {folder / 'weights'} --shards "
-        encode += f"{folder / split} --out {folder / 'latents' / split}"
+        encode += f"{folder / split} --out {folder / 'latents' / split} --stride 1"
         assert egosim(encode.split()) == 0
     return folder
 
