@@ -8,14 +8,14 @@
 A row has the frame as a lossless PNG (feature of dtype image), and two float32 vectors of hands and
 camera: `observation.state` at that frame and `action` at the next frame. The joints of the hands,
 the pose of the camera and its intrinsics are also stored as float64, in the columns `HANDS`,
-`POSES` and `INTRINSICS`. The first frame of a clip replaces the last frame of the clip before.
+`POSES` and `INTRINSICS`, and so are other vectors. The first frame of a clip replaces the last frame of the clip before.
 Followed: `lerobot` 0.4.4, `datasets/lerobot_dataset.py`, `datasets/utils.py`.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -62,6 +62,8 @@ class ClipRecord:
     """Row of hands and camera at each frame."""
     action: Action
     """Cameras, joints of the hands and caption of the clip."""
+    others: Mapping[str, Float[np.ndarray, "f _"]] = field(default_factory=dict)
+    """Other vectors of each frame, by the name of their feature."""
 
 
 @no_type_check
@@ -151,6 +153,7 @@ def _numbers(clip: ClipRecord, frame: int) -> dict[str, np.ndarray]:
         HANDS: clip.action.joints_m[frame].astype(float).ravel(),
         POSES: np.asarray(cameras.world_from_camera[frame], float).ravel(),
         INTRINSICS: np.asarray(cameras.intrinsics_px, float).ravel(),
+        **{name: np.asarray(values[frame], float) for name, values in clip.others.items()},
     }
 
 
@@ -205,9 +208,8 @@ def _write_table(path: Path, columns: dict[str, Any]) -> None:
     import pyarrow.parquet as pq
 
     image = pa.struct({"bytes": pa.binary(), "path": pa.string()})
-    short, long = pa.list_(pa.float32()), pa.list_(pa.float64())
-    types = {IMAGE: image, STATE: short, ACTION: short, "timestamp": pa.float32(),
-             HANDS: long, POSES: long, INTRINSICS: long}  # fmt: skip
+    short = pa.list_(pa.float32())
+    types = {IMAGE: image, STATE: short, ACTION: short, "timestamp": pa.float32()}
     arrays = {
         name: pa.array(values, types.get(name, pa.int64() if name in COUNTERS else None))
         for name, values in columns.items()
@@ -240,8 +242,9 @@ def _write_meta(
     (size,) = totals.sizes
     vector = {"dtype": "float32", "shape": [len(names)], "names": list(names)}
     exact = {
-        name: {"dtype": "float64", "shape": [totals.vectors[name]], "names": None}
-        for name in (HANDS, POSES, INTRINSICS)
+        name: {"dtype": "float64", "shape": [length], "names": None}
+        for name, length in totals.vectors.items()
+        if name not in (STATE, ACTION)
     }
     image = {"dtype": "image", "shape": [*size, 3], "names": ["height", "width", "channels"]}
     own = {name: {"dtype": "int64", "shape": [1], "names": None} for name in COUNTERS}

@@ -20,7 +20,7 @@ from egosim_jax.robots.background import Background, first_cloud, remove_hands
 from egosim_jax.robots.drawing import Drawn, Shape, draw
 from egosim_jax.robots.models import RobotModel
 from egosim_jax.robots.placement import Base, Placed, place
-from egosim_jax.robots.retarget import Grips, grips_of
+from egosim_jax.robots.retarget import Grips, continuous, grips_of
 from egosim_jax.robots.sources import Source
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.simulation.start import Start
@@ -237,19 +237,20 @@ def _report(follower: Follower, fps: int) -> dict[str, Any]:
 
 def export(conversion: Conversion, folder: Path) -> None:
     """Write a LeRobot dataset: joint positions, opening and grip of each robot, and the frames."""
-    names, rows = [], []
+    names, rows, grips = [], [], {}
     for follower in conversion.followers:
         prefix = f"{follower.hand}." if len(conversion.followers) > 1 else ""
         names += [f"{prefix}{name}.pos" for name in conversion.arm.joints]
         names += [f"{prefix}gripper.opening_m"]
-        names += [f"{prefix}grip.{n}" for n in ("x", "y", "z", "qx", "qy", "qz", "qw")]
         rows.append(rows_of(follower))
+        grips[f"observation.{prefix}grip"] = poses_of(follower)
     table = np.concatenate(rows, axis=1)
     clips = [
         ClipRecord(
             frames=conversion.drawn[clip].frames,
             rows=table[conversion.span(clip)],
             action=_skeletons(conversion, clip, action),
+            others={name: values[conversion.span(clip)] for name, values in grips.items()},
         )
         for clip, action in enumerate(conversion.episode.actions)
     ]
@@ -286,18 +287,16 @@ def triplets_of(conversion: Conversion, name: str, renderer: Renderer) -> Iterat
 
 
 def rows_of(follower: Follower) -> Float[np.ndarray, "f d"]:
-    """Return joint positions, opening, and place and quaternion of the grip in the base frame."""
+    """Return joint positions and opening in each frame."""
     track = follower.placed.track
-    turn = Rotation.from_matrix(track.base_from_grip[:, :3, :3]).as_quat(canonical=True)
-    return np.concatenate(
-        [
-            track.q[:, follower.robot.joint_at],
-            track.opening_m[:, None],
-            track.base_from_grip[:, :3, 3],
-            turn,
-        ],
-        axis=1,
-    )
+    return np.concatenate([track.q[:, follower.robot.joint_at], track.opening_m[:, None]], axis=1)
+
+
+def poses_of(follower: Follower) -> Float[np.ndarray, "f 7"]:
+    """Return place and quaternion (x, y, z, w) of the grip in the base frame, in each frame."""
+    poses = follower.placed.track.base_from_grip
+    turns = continuous(Rotation.from_matrix(poses[:, :3, :3]).as_quat())
+    return np.concatenate([poses[:, :3, 3], turns], axis=1)
 
 
 def _skeletons(conversion: Conversion, clip: int, action: Action) -> Action:

@@ -57,7 +57,7 @@ def grips_of(joints_m: Float[np.ndarray, "f j 3"], *, fps: int) -> Grips:
     sigma = SMOOTHING_S * fps
     place = _smooth(pinch, known, sigma)
     turns = Rotation.from_matrix(turns)
-    quaternions = _continuous(turns.as_quat())
+    quaternions = continuous(turns.as_quat())
     turns = Rotation.from_quat(_smooth(quaternions, known, sigma))
     poses = np.tile(np.eye(4), (len(known), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = turns.as_matrix(), place
@@ -89,7 +89,7 @@ def _turns(along: np.ndarray, across: np.ndarray) -> Float[np.ndarray, "f 3 3"]:
     return np.stack([x, np.cross(z, x), z], axis=2)
 
 
-def _continuous(quaternions: np.ndarray) -> np.ndarray:
+def continuous(quaternions: np.ndarray) -> np.ndarray:
     """Return the quaternions with signs that make neighbors similar."""
     signs = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     return quaternions * np.cumprod([1.0, *signs])[:, None]

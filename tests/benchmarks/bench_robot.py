@@ -1,13 +1,15 @@
 """Robots in place of the hands of the tabletop world: reach, limits, depth order, replay, time.
 
     python -m tests.benchmarks.bench_robot [--robot NAME] [--scenes N] [--size F H W FPS]
+        [--out FOLDER]
 
 For each scene: the share of frames that the robot reaches, its largest distance from the pinch
 point, its distance from the table, and its speed relative to the limits; the share of the objects'
 pixels where the robot is in front or behind as in the ray-cast scene; the largest distance between
 the grip in the LeRobot dataset and the grip that MuJoCo gives for the dataset's joint positions;
 the sources of the pixels behind hands; and the seconds of conversion and dataset (clock and CPU),
-without the making of the scene. The last line has the peak memory of the process.
+without the making of the scene. The last line has the peak memory of the process. FOLDER keeps the
+datasets, for example for `lerobot-doctor check` and `lelint check`.
 """
 
 from __future__ import annotations
@@ -71,12 +73,13 @@ def replay_error(found: Conversion, folder: Path) -> float:
     robot, joints = follower.robot, len(follower.robot.arm.joints)
     table = pq.read_table(folder / "data/chunk-000/file-000.parquet")
     errors, data = [], mujoco.MjData(robot.mj)
-    for row in np.array(table["observation.state"].to_pylist()):
+    rows, grips = (np.array(table[f"observation.{n}"].to_pylist()) for n in ("state", "grip"))
+    for row, grip in zip(rows, grips, strict=True):
         q = robot.home
         q[robot.joint_at] = row[:joints]
         data.qpos[:] = robot.open(q, row[joints])
         mujoco.mj_kinematics(robot.mj, data)
-        errors.append(np.linalg.norm(grip_of(robot, data)[:3, 3] - row[joints + 1 : joints + 4]))
+        errors.append(np.linalg.norm(grip_of(robot, data)[:3, 3] - grip[:3]))
     return float(max(errors))
 
 
@@ -86,6 +89,7 @@ def main() -> None:
     parser.add_argument("--robot", default="panda")
     parser.add_argument("--scenes", type=int, default=24)
     parser.add_argument("--size", type=int, nargs=4, default=(17, 96, 160, 8))
+    parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     spec = VideoSpec(**dict(zip(("frames", "height", "width", "fps"), args.size, strict=True)))
     robot = load_model(arm_of(args.robot))
@@ -95,9 +99,10 @@ def main() -> None:
         began, cpu = time.monotonic(), time.process_time()
         found = convert(source, robot)
         with tempfile.TemporaryDirectory() as name:
-            export(found, Path(name) / "data")
+            folder = (args.out or Path(name)) / str(seed)
+            export(found, folder)
             seconds = time.monotonic() - began, time.process_time() - cpu
-            replayed = replay_error(found, Path(name) / "data")
+            replayed = replay_error(found, folder)
         report = report_of(found)
         (entry,) = report["robots"]
         print(

@@ -74,17 +74,18 @@ def test_the_dataset_replays_the_path_of_the_grip(converted, tmp_path):
     assert info["robot_type"] == "toy"
     names = info["features"]["observation.state"]["names"]
     table = pq.read_table(tmp_path / "data/data/chunk-000/file-000.parquet")
-    rows = np.array(table["observation.state"].to_pylist())
+    rows, grips = (np.array(table[f"observation.{n}"].to_pylist()) for n in ("state", "grip"))
     assert rows.shape == (2 * SPEC.frames - 1, len(names))
+    assert info["features"]["observation.grip"]["shape"] == [7]
+    assert (grips[1:, 3:] * grips[:-1, 3:]).sum(axis=1).min() > 0  # no quaternion changes its sign
     robot = converted.followers[0].robot
     data = mujoco.MjData(robot.mj)
-    for row in rows:
+    for row, grip in zip(rows, grips, strict=True):
         q = robot.home
         q[robot.joint_at] = row[: len(TOY.joints)]
         data.qpos[:] = robot.open(q, row[names.index("gripper.opening_m")])
         mujoco.mj_kinematics(robot.mj, data)
-        place = row[[names.index(f"grip.{axis}") for axis in "xyz"]]
-        np.testing.assert_allclose(grip_of(robot, data)[:3, 3], place, atol=1e-5)
+        np.testing.assert_allclose(grip_of(robot, data)[:3, 3], grip[:3], atol=1e-5)
 
 
 def test_the_training_clips_have_the_skeletons_of_the_gripper(converted, tmp_path):
