@@ -8,7 +8,8 @@
 A row has the frame as a lossless PNG (feature of dtype image), and two float32 vectors of hands and
 camera: `observation.state` at that frame and `action` at the next frame. The joints of the hands,
 the pose of the camera and its intrinsics are also stored as float64, in the columns `HANDS`,
-`POSES` and `INTRINSICS`, and so are other vectors. The first frame of a clip replaces the last frame of the clip before.
+`POSES` and `INTRINSICS`, and so are other vectors. The first frame of a clip replaces the last
+frame of the clip before.
 Followed: `lerobot` 0.4.4, `datasets/lerobot_dataset.py`, `datasets/utils.py`.
 """
 
