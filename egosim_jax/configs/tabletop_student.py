@@ -1,7 +1,6 @@
 """Causal student of `tabletop`: it makes a clip in three chunks, of 1, 8 and 8 frames.
 
-Its weights are a LoRA of the denoiser of `tabletop`, in the same folder. They were trained in two
-denoising steps; one step is as good and half the work (`egosim experiment students`).
+Its weights are a LoRA of the denoiser of `tabletop`, in the same folder.
 """
 
 from dataclasses import replace
@@ -9,7 +8,7 @@ from dataclasses import replace
 from egosim_jax.configs.tabletop import CONFIG as TABLETOP
 from egosim_jax.models.chunks import Chunks
 
-CONFIG = replace(TABLETOP, name="tabletop_student", steps=1, chunks=Chunks(sizes=(1, 2, 2)))
+CONFIG = replace(TABLETOP, name="tabletop_student", chunks=Chunks(sizes=(1, 2, 2)))
 SHIPPED_WITH = "tabletop"
 """Config whose folder has the weights."""
 TRAINING = (

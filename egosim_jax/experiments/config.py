@@ -107,7 +107,7 @@ class Students(ModelExperiment):
     """Name of the teacher, whose weights are in the student's folder."""
     teacher_steps: tuple[int, ...] = (2, 4, 10)
     """Denoising steps of the teacher, a row for each."""
-    student_steps: tuple[int, ...] = (2,)
+    student_steps: tuple[int, ...] = (1,)
     """Other denoising steps of the student, a row for each."""
     stages: tuple[str, ...] = ()
     """Stages of the student's training, each as NAME=FILE; the file is a run's lora.safetensors."""
