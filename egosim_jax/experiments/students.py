@@ -104,7 +104,7 @@ def _others(
     for steps in settings.student_steps:
         chunks = replace(chunks_of(student.config), first_steps=steps)
         config = replace(student.config, steps=steps, chunks=chunks)
-        yield f"{STUDENT}, {steps} step{'s' * (steps > 1)}", Generator(config, networks)
+        yield f"{STUDENT}, steps: {steps}", Generator(config, networks)
 
 
 def _compare_clips(settings: Students, student: Generator, others: Iterator[Row]) -> dict:
