@@ -197,9 +197,10 @@ class Hyperparameters:
 class Embodiment:
     """Train on human hands, then on a few robot clips: all weights, or a LoRA.
 
-    Another model is trained only on the robot clips. Prints the scores of each model on held-out
-    robot clips. Writes report.json, contact_sheet.png and curves.png. The same command resumes an
-    interrupted experiment.
+    Another model is trained only on the robot clips. With --robot, one more is trained on as many
+    human clips that were converted to clips of that robot (`egosim robot`). Prints the scores of
+    each model on held-out robot clips. Writes report.json, contact_sheet.png and curves.png. The
+    same command resumes an interrupted experiment.
     """
 
     out: Path
@@ -226,6 +227,10 @@ class Embodiment:
     """Training of a LoRA on robot clips, from the human model."""
     scratch: Hyperparameters = Hyperparameters(steps=200, learning_rate=2e-3, warmup=50)
     """Training on robot clips from random weights."""
+    robot: str | None = None
+    """Robot of the converted clips, a name in `egosim robot list`; None: no converted clips."""
+    converted: Hyperparameters = Hyperparameters(steps=200, learning_rate=5e-4, warmup=10)
+    """Training of all weights on converted clips, from the human model."""
     rank: int = 16
     """Rank of the LoRA."""
     dropout: float = 0.15

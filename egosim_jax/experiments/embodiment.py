@@ -10,12 +10,14 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from egosim_jax import configs
+from egosim_jax import configs, rendering
 from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.configs.model import ModelConfig
-from egosim_jax.data.shards import ShardReader
+from egosim_jax.data.manifest import MANIFEST
+from egosim_jax.data.pack import triplet_record
+from egosim_jax.data.shards import ShardReader, ShardWriter
 from egosim_jax.data.sheet import draw_sheet
-from egosim_jax.evaluation.metrics.report import Summary, print_table, summarize
+from egosim_jax.evaluation.metrics.report import Summary, paired_differences, print_table, summarize
 from egosim_jax.experiments.config import Embodiment, Hyperparameters
 from egosim_jax.experiments.scenes import (
     DEFINITIONS,
@@ -40,21 +42,28 @@ from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.bounded import read_lines
 from egosim_jax.io.run import open_folder, write_json
 from egosim_jax.io.weights import hashes
+from egosim_jax.robots.arms import arm_of
+from egosim_jax.robots.conversion import convert, triplets_of
+from egosim_jax.robots.models import RobotModel, load_model
+from egosim_jax.robots.sources import of_episode
 from egosim_jax.runtime.progress import track
 from egosim_jax.train.encode import encode_shards
 from egosim_jax.train.tasks.denoising import Denoising
 from egosim_jax.types import InputError, Kind, check_counts, check_seed
+from egosim_jax.worlds.tabletop import make_sequence, to_episode
 from egosim_jax.worlds.tabletop.dataset import DatasetConfig
 
 Videos = Mapping[str, Sequence[np.ndarray]]
 """Videos of all scenes by method."""
 Validation = Mapping[int, float]
 """Validation loss by step."""
+CONVERTED = "converted"
 METHODS = {
     "human": "human alone",
     "full": "human, then all weights",
     "lora": "human, then a LoRA",
     "scratch": "robot alone",
+    CONVERTED: "human, then converted clips",
 }
 """Titles of the trained models, by field of the settings, which is also their folder."""
 LOSSES = {
@@ -82,7 +91,8 @@ def run(settings: Embodiment) -> None:
         }
     )
     check_seed(settings.first_scene, name="--first-scene")
-    for stage in (settings.human, settings.full, settings.lora, settings.scratch):
+    stages = (settings.human, settings.full, settings.lora, settings.scratch, settings.converted)
+    for stage in stages:
         train_config(stage)  # raises for invalid values before any work
     experiment = _Experiment(settings)
     if conditions_of(experiment.model)[1] == "mesh":
@@ -98,9 +108,15 @@ def run(settings: Embodiment) -> None:
         for seed in track(experiment.unseen, "making held-out scenes", total=settings.held_out)
     ]
     videos = experiment.generate_all(trained, scenes)
-    validations = {name: _validation(settings.out / name) for name in METHODS}
-    table = _compare(scenes, videos, validations)
+    validations = {name: _validation(settings.out / name) for name in trained}
+    scores = _scores(scenes, videos)
+    table = _summaries(scores, validations)
     report = {"definitions": REPORT_DEFINITIONS, "table": table, "validation": validations}
+    if CONVERTED in trained:
+        report["differences"] = {
+            name: paired_differences(scores[CONVERTED], scores[name], MEASURES)
+            for name in ("full", "human")
+        }
     write_json(settings.out / "report.json", report)
     print_table(
         "",
@@ -108,7 +124,11 @@ def run(settings: Embodiment) -> None:
         {**LOSSES, **MEASURES},
         title="robot, held out: mean ± spread over scenes",
     )
-    for name in ("full", "lora"):
+    if CONVERTED in trained:
+        differences = {METHODS[name]: row for name, row in report["differences"].items()}
+        title = "with converted clips, less: mean difference and its 95 % interval"
+        print_table("", differences, MEASURES, title=title)
+    for name in trained.keys() - {"human", "scratch"}:
         print(_verdict(METHODS[name], validations[name]))
     _draw(settings.out, scenes, videos, validations)
 
@@ -125,6 +145,7 @@ class _Experiment:
         self.human = range(settings.first_scene, first)
         self.robot = range(first, first + settings.robot_scenes)
         self.unseen = range(self.robot.stop, self.robot.stop + settings.held_out)
+        self.arm = None if settings.robot is None else load_model(arm_of(settings.robot))
 
     def train_all(self) -> dict[str, Path]:
         """Train all models; return the folder of their weights, or the file of the LoRA."""
@@ -133,12 +154,16 @@ class _Experiment:
         robot_data = self._encode("robot", self.robot, "robot")
         self._encode("held_out", self.unseen, "robot")
         human = self._train("human", settings.human, human_data)
-        return {
+        trained = {
             "human": human,
             "full": self._train("full", settings.full, robot_data, start=human),
             "lora": self._train("lora", settings.lora, robot_data, start=human, rank=settings.rank),
             "scratch": self._train("scratch", settings.scratch, robot_data),
         }
+        if self.arm is not None:
+            data = self._encode_frames(CONVERTED, self._convert(self.arm))
+            trained[CONVERTED] = self._train(CONVERTED, settings.converted, data, start=human)
+        return trained
 
     def generate_all(self, trained: Mapping[str, Path], scenes: Sequence[HeldOutClip]) -> Videos:
         """Generate the held-out clips by each model; add the baselines."""
@@ -149,7 +174,7 @@ class _Experiment:
                 lambda name=name: generate(self._generator(trained, name), scenes, batch_size=size),
                 total=len(scenes),
             )
-            for name in METHODS
+            for name in trained
         }
         reconstructed = cached_videos(
             folder / "autoencoder.npy",
@@ -165,8 +190,28 @@ class _Experiment:
     def _encode(self, split: str, seeds: range, kind: Kind) -> Path:
         """Make the clips of a split and cache their latents."""
         config = DatasetConfig(seeds=tuple(seeds), clips=1, spec=self.model.video, kind=kind)
-        latents = self.out / "latents" / split
         frames = make_frames(config, self.out / "frames" / split, grid=self.model.grid)
+        return self._encode_frames(split, frames)
+
+    def _convert(self, robot: RobotModel) -> Path:
+        """Make human clips of the robot scenes, converted to clips of a robot."""
+        frames, spec, name = self.out / "frames" / CONVERTED, self.model.video, robot.arm.name
+        if (frames / MANIFEST).exists():
+            return frames
+        renderer = rendering.get("jax")
+        with ShardWriter(frames, kind="frames", spec=spec, grid=self.model.grid) as writer:
+            for seed in track(self.robot, f"converting to {name}", total=len(self.robot)):
+                episode = to_episode([next(make_sequence(seed, spec=spec))], fps=spec.fps)
+                found = convert(of_episode(episode), robot)
+                px = self.model.point_px
+                for triplet in triplets_of(found, f"{name}_{seed}", renderer, point_px=px):
+                    record = triplet_record(triplet)
+                    writer.add(record.arrays, record.metadata)
+        return frames
+
+    def _encode_frames(self, split: str, frames: Path) -> Path:
+        """Cache the latents of the clips of a split."""
+        latents = self.out / "latents" / split
         encode_shards(
             self.model,
             self.origin,
@@ -215,7 +260,7 @@ def _draw(
     """Draw the contact sheet and the validation curves."""
     sheet = out / "contact_sheet.png"
     clips = [
-        scene.on_sheet({name: videos[name][number] for name in METHODS})
+        scene.on_sheet({name: videos[name][number] for name in validations})
         for number, scene in enumerate(scenes[:SHEET_SCENES])
     ]
     draw_sheet(clips, sheet, moments=SHEET_MOMENTS)
@@ -230,17 +275,23 @@ def _validation(folder: Path) -> dict[int, float]:
     return {x["step"]: x["validation_loss"] for _, x in lines if "validation_loss" in x}
 
 
-def _compare(
-    scenes: Sequence[HeldOutClip], videos: Videos, validations: Mapping[str, Validation]
+def _scores(scenes: Sequence[HeldOutClip], videos: Videos) -> dict[str, list[dict[str, float]]]:
+    """Return the scores of each method on each scene."""
+    names = track(videos, "comparing", total=len(videos))
+    return {name: evaluate(scenes, videos[name]) for name in names}
+
+
+def _summaries(
+    scores: Mapping[str, list[dict[str, float]]], validations: Mapping[str, Validation]
 ) -> dict[str, Summary]:
     """Summarize each method over the scenes; trained models also have losses."""
     table = {}
-    for name in track(videos, "comparing", total=len(videos)):
+    for name, found in scores.items():
         losses = {}
         if name in validations:
             first, *_, last = validations[name].values()
             losses = {"before": {"mean": first}, "after": {"mean": last}}
-        table[name] = {**losses, **summarize(evaluate(scenes, videos[name]), MEASURES)}
+        table[name] = {**losses, **summarize(found, MEASURES)}
     return table
 
 

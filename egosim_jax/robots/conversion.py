@@ -264,15 +264,17 @@ def export(conversion: Conversion, folder: Path) -> None:
     )
 
 
-def triplets_of(conversion: Conversion, name: str, renderer: Renderer) -> Iterator[Triplet]:
+def triplets_of(
+    conversion: Conversion, name: str, renderer: Renderer, *, point_px: int = POINT_PX
+) -> Iterator[Triplet]:
     """Yield the triplet of each clip: the scene before it, the grippers' skeletons, the robots.
 
-    `name` begins the ids of the clips.
+    `name` begins the ids of the clips. `point_px` is the size of the points of the model's priors.
     """
     source = conversion.source
     for clip, (state, given) in enumerate(zip(source.states, source.episode.actions, strict=True)):
         action = _skeletons(conversion, clip, given)
-        view = renderer.render(state, action.cameras, point_px=POINT_PX)
+        view = renderer.render(state, action.cameras, point_px=point_px)
         hands, _ = renderer.draw_hands(action.joints_m, action.cameras, kind="robot")
         yield Triplet(
             video_id=f"{name}_{clip + 1}",

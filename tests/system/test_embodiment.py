@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,8 +12,11 @@ from safetensors.numpy import load_file
 from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
 from egosim_jax.configs.model import Networks
+from egosim_jax.data.shards import ShardReader
+from egosim_jax.experiments import embodiment
+from tests.unit.robots.toy import TOY, make_toy
 
-MODELS = {"human", "full", "lora", "scratch"}
+MODELS = {"human", "full", "lora", "scratch", "converted"}
 ALIKE = {"steps": 2, "batch-size": 2, "warmup": 1, "learning-rate": 0.01}
 
 
@@ -20,7 +24,17 @@ def experiment(weights: Path, run: Path, *more: str) -> list[str]:
     fixed = ["--config", "debug", "--weights", str(weights), "--out", str(run)]
     counts = ["--human-scenes", "2", "--robot-scenes", "2", "--held-out", "2", "--batch-size", "2"]
     stages = [str(x) for model in MODELS for k, v in ALIKE.items() for x in (f"--{model}.{k}", v)]
-    return ["experiment", "embodiment", *fixed, *counts, "--rank", "2", *stages, *more]
+    robot = ["--robot", TOY.name]
+    return ["experiment", "embodiment", *fixed, *counts, *robot, "--rank", "2", *stages, *more]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def toy() -> Iterator[None]:
+    """Put an arm without files of the Menagerie in place of every other one."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(f"{embodiment.__name__}.arm_of", lambda _: TOY)
+        patch.setattr(f"{embodiment.__name__}.load_model", lambda _: make_toy())
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -52,9 +66,20 @@ def test_validation_losses_are_finite_before_and_after(report):
 
 def test_robot_trainings_start_from_the_human_model(report):
     line = report["table"]
-    for name in ("full", "lora"):
+    for name in ("full", "lora", "converted"):
         assert line[name]["before"]["mean"] == pytest.approx(line["human"]["after"]["mean"])
     assert line["scratch"]["before"]["mean"] == pytest.approx(line["human"]["before"]["mean"])
+
+
+def test_converted_clips_are_of_the_robot_scenes_and_compared_with_native_ones(run, report):
+    source = ShardReader(run / "frames" / "converted")
+    assert [record.metadata["video_id"] for record in source] == ["toy_5002_1", "toy_5003_1"]
+    differences = report["differences"]
+    assert differences.keys() == {"full", "human"}
+    table = report["table"]
+    for name, row in differences.items():
+        gap = table["converted"]["psnr"]["mean"] - table[name]["psnr"]["mean"]
+        assert row["psnr"]["mean"] == pytest.approx(gap)
 
 
 def test_every_scene_belongs_to_one_split(run):
@@ -76,7 +101,7 @@ def test_the_weights_of_each_model_are_complete(run):
 
 def test_the_sheet_has_a_row_for_each_model_between_conditions_and_ground_truth(run):
     with Image.open(run / "contact_sheet.png") as sheet:
-        assert sheet.size == (6 * 96, 2 * (16 + 7 * 64))
+        assert sheet.size == (6 * 96, 2 * (16 + 8 * 64))
     assert (run / "curves.png").exists()
 
 
