@@ -1,4 +1,4 @@
-"""Persistent cache of compiled functions, which then run without tracing or compiling.
+"""Persistent cache of compiled functions and traced networks, which need no trace or compilation.
 
 The files are in a `PrivateCache`, because reading one runs native code in it. Its key is the digest
 of everything that the compiled function depends on: its name and config, the shapes of its
@@ -18,7 +18,7 @@ import pickle
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -36,8 +36,8 @@ TRACED = (
     "generation/stream.py", "models", "sharding.py", "types",
 )  # fmt: skip
 """Modules that run while a function is traced, and so determine the compiled program."""
-FOLDER, MAX_FILES = "executables", 64
-"""Name of the cache, and its maximum number of compiled functions."""
+FOLDER, MAX_FILES = "executables", 128
+"""Name of the cache, and its maximum number of compiled functions and traced networks."""
 JAX_FOLDER, JAX_MAX_FILES = "jax", 1024
 """Name of jax's own compilation cache, and the number of files that a start leaves in it."""
 
@@ -63,7 +63,7 @@ def cached_compile(key: Any, args: Any, compile_fn: Callable[[], Any]) -> Any:
                 execution_devices=_devices(args),
             )
         except Exception as error:  # whatever is wrong with it, it can be compiled again
-            warnings.warn(f"{name} cannot be used and is compiled again: {error}", stacklevel=2)
+            _warn_unusable(name, error)
     with _without_jax_cache():
         compiled = compile_fn()
     try:
@@ -71,6 +71,31 @@ def cached_compile(key: Any, args: Any, compile_fn: Callable[[], Any]) -> Any:
     except (ValueError, NotImplementedError) as error:  # cannot be serialized
         warnings.warn(f"{name} was not stored: {error}", stacklevel=2)
     return compiled
+
+
+def cached_trace(key: Any, trace_fn: Callable[[], Any]) -> Any:
+    """Return the network of shapes that is traced from a key, from the cache if it is there.
+
+    It depends only on the key and the code. It is not stored if `cached_compile` would not store
+    with this key, or if it holds a function that has no importable name.
+    """
+    sources = _sources(key)
+    if sources is None or (cache := PrivateCache.open(FOLDER, most=MAX_FILES)) is None:
+        return trace_fn()
+    name = _hash({"key": repr((key, sources)), **_libraries()})
+    if (data := cache.get(name)) is not None:
+        try:
+            return pickle.loads(data)  # noqa: S301
+        except Exception as error:  # whatever is wrong with it, it can be traced again
+            _warn_unusable(name, error)
+    traced = trace_fn()
+    with suppress(pickle.PicklingError, AttributeError, TypeError):
+        cache.put(name, pickle.dumps(traced))
+    return traced
+
+
+def _warn_unusable(name: str, error: Exception) -> None:
+    warnings.warn(f"{name} cannot be used and is made again: {error}", stacklevel=3)
 
 
 def share_with_jax() -> None:
@@ -116,11 +141,19 @@ def _digest(key: Any, args: Any) -> str:
         "devices": [devices[0].device_kind, len(devices), devices[0].client.platform_version],
         "precision": jax.config.values["jax_default_matmul_precision"],
         "wide": jax.config.values["jax_enable_x64"],
-        "versions": [metadata.version(name) for name in LIBRARIES],
         "variables": [os.environ.get(name) for name in VARIABLES],
         "processor": _processor(),
-        "code": _code(),
+        **_libraries(),
     }
+    return _hash(parts)
+
+
+def _libraries() -> dict[str, Any]:
+    """Return the versions of the libraries and the digest of the code."""
+    return {"versions": [metadata.version(name) for name in LIBRARIES], "code": _code()}
+
+
+def _hash(parts: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
