@@ -18,6 +18,7 @@ from egosim_jax.rendering import RendererName
 from egosim_jax.rendering.portrait import write_portrait
 from egosim_jax.rendering.rerun_log import RECORDING, Recording
 from egosim_jax.runtime.command import ExitCode, HelpGroups
+from egosim_jax.runtime.phases import phase
 from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import InputError, Kind, VideoSpec, check_counts, check_seed
 
@@ -80,19 +81,6 @@ class Simulate:
 
     def run(self) -> int:
         """Simulate; write videos, states and scores."""
-        from egosim_jax import configs, rendering
-        from egosim_jax.evaluation.metrics.loop import DEFINITIONS
-        from egosim_jax.generation.generator import Generator
-        from egosim_jax.io.digest import fingerprint
-        from egosim_jax.io.executables import share_with_jax
-        from egosim_jax.io.journal import Journal
-        from egosim_jax.io.run import open_folder, write_json
-        from egosim_jax.io.weights import hashes
-        from egosim_jax.perception import registry
-        from egosim_jax.perception.recorded import RecordedConfig
-        from egosim_jax.simulation.rollout import OUTPUTS, Rollout
-        from egosim_jax.simulation.simulator import Simulator, check_update_every
-
         check_counts({"--clips": self.clips, "--steps": self.steps})
         check_seed(self.seed)
         if self.update == "none" and self.perception != Simulate.perception:
@@ -100,6 +88,20 @@ class Simulate:
                 f"--perception {self.perception} has no effect with --update none: give --update "
                 "full, or omit this option."
             )
+        with phase(f"loads JAX and {self.config}"):
+            from egosim_jax import configs, rendering
+            from egosim_jax.evaluation.metrics.loop import DEFINITIONS
+            from egosim_jax.generation.generator import Generator
+            from egosim_jax.io.digest import fingerprint
+            from egosim_jax.io.executables import share_with_jax
+            from egosim_jax.io.journal import Journal
+            from egosim_jax.io.run import open_folder, write_json
+            from egosim_jax.io.weights import hashes
+            from egosim_jax.perception import registry
+            from egosim_jax.perception.recorded import RecordedConfig
+            from egosim_jax.simulation.rollout import OUTPUTS, Rollout
+            from egosim_jax.simulation.simulator import Simulator, check_update_every
+
         share_with_jax()
         config = configs.get(self.config)
         config = replace(config, steps=self.steps or config.steps)
@@ -108,7 +110,8 @@ class Simulate:
         folder = self.out or Path("runs") / f"simulate_{self.seed}"
         pipeline = registry.parse(self.perception) if self.update == "full" else None
         reads = pipeline is not None and registry.reads_ground_truth(pipeline)
-        episode = self._episode(config.video, with_ground_truth=reads)
+        with phase(f"loads {self.episode}" if self.episode else "makes the tabletop scene"):
+            episode = self._episode(config.video, with_ground_truth=reads)
         perception = None
         if pipeline is not None:
             if isinstance(pipeline, RecordedConfig):
@@ -120,22 +123,21 @@ class Simulate:
             "weights": hashes(weights, student=config.chunks is not None),
             "episode": fingerprint(episode),
         }
-        Journal(folder, outputs=OUTPUTS)  # refuses a damaged journal before the weights are loaded
+        journal = Journal(folder, outputs=OUTPUTS)  # a damaged one is refused before the weights
         free = ["simulate.weights", "simulate.first_frame", "simulate.episode"]
         open_folder(folder, made_of, mutable=free)
-        print(
-            f"{folder}: {len(episode.actions)} clips by {self.config}; the first one waits until "
-            "the model is compiled",
-            file=sys.stderr,
-            flush=True,
-        )
+        count = len(episode.actions)
+        print(f"{folder}: {count} clips by {self.config}", file=sys.stderr, flush=True)
         made_on = configs.trained_on(self.config, weights)
         if note := configs.scene_warning(made_on, episode.state.provenance):
             print(note, file=sys.stderr, flush=True)
         outputs = _Outputs(folder, episode)
+        generator = Generator.load(config, weights, renderer=rendering.get(self.renderer))
+        if f"{count} generate" not in journal.done:
+            generator.compile(1, streamed=True)
         simulator = Simulator(
             show=outputs.show,
-            generator=Generator.load(config, weights, renderer=rendering.get(self.renderer)),
+            generator=generator,
             perception=perception,
             fps=config.video.fps,
             update_every=self.update_every,
@@ -272,16 +274,17 @@ class _Outputs:
                 self._write_state(0, state)
                 if find_spec("rerun"):
                     recording = Recording(folder / RECORDING, folder.name, up=up)
-            report.append(
-                {
-                    "clip": self.number,
-                    "action": action.prompt,
-                    "notes": list(step.notes),
-                    **({} if step.latency is None else asdict(step.latency)),
-                    **_score(simulator, step, action, truth),
-                }
-            )
-            sheet.append(self._write_step(simulator, step, action, truth))
+            with phase(f"clip {self.number}: scores and draws", only_if_long=True):
+                report.append(
+                    {
+                        "clip": self.number,
+                        "action": action.prompt,
+                        "notes": list(step.notes),
+                        **({} if step.latency is None else asdict(step.latency)),
+                        **_score(simulator, step, action, truth),
+                    }
+                )
+                sheet.append(self._write_step(simulator, step, action, truth))
             if recording is not None:
                 recording.add(
                     state,

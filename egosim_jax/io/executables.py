@@ -26,6 +26,7 @@ from typing import Any
 import jax
 
 from egosim_jax.io.private import PrivateCache, private_folder
+from egosim_jax.runtime.phases import phase
 
 PACKAGE = Path(__file__).parents[1]
 LIBRARIES = ("jax", "jaxlib", "flax")
@@ -42,29 +43,34 @@ JAX_FOLDER, JAX_MAX_FILES = "jax", 1024
 """Name of jax's own compilation cache, and the number of files that a start leaves in it."""
 
 
-def cached_compile(key: Any, args: Any, compile_fn: Callable[[], Any]) -> Any:
+def cached_compile(
+    key: Any, args: Any, compile_fn: Callable[[], Any], *, about: str = "a function"
+) -> Any:
     """Return the compiled function of this key and these arguments, from the cache if it is there.
 
-    `args` are arrays or shapes. Without a private folder, with several processes, or with a class
-    in the key whose source is not in a file, it is compiled and not stored.
+    `args` are arrays or shapes; `about` names the function to the user. Without a private folder,
+    with several processes, or with a class in the key whose source is not in a file, it is compiled
+    and not stored.
     """
     from jax.experimental import serialize_executable
 
     sources = _sources(key)
-    if sources is None or jax.process_count() > 1:
-        return compile_fn()
-    if (cache := PrivateCache.open(FOLDER, most=MAX_FILES)) is None:
-        return compile_fn()
+    alone = sources is not None and jax.process_count() == 1
+    cache = PrivateCache.open(FOLDER, most=MAX_FILES) if alone else None
+    if cache is None:
+        with phase(f"compiles {about}"):
+            return compile_fn()
     name = _digest((key, sources), args)
     if (data := cache.get(name)) is not None:
         try:
-            return serialize_executable.deserialize_and_load(
-                *pickle.loads(data),  # noqa: S301
-                execution_devices=_devices(args),
-            )
+            with phase(f"loads {about}", only_if_long=True):
+                return serialize_executable.deserialize_and_load(
+                    *pickle.loads(data),  # noqa: S301
+                    execution_devices=_devices(args),
+                )
         except Exception as error:  # whatever is wrong with it, it can be compiled again
             _warn_unusable(name, error)
-    with _without_jax_cache():
+    with phase(f"compiles {about}; cached next time"), _without_jax_cache():
         compiled = compile_fn()
     try:
         cache.put(name, pickle.dumps(serialize_executable.serialize(compiled)))
