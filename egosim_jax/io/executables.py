@@ -41,6 +41,9 @@ FOLDER, MAX_FILES = "executables", 128
 """Name of the cache, and its maximum number of compiled functions and traced networks."""
 JAX_FOLDER, JAX_MAX_FILES = "jax", 1024
 """Name of jax's own compilation cache, and the number of files that a start leaves in it."""
+JAX_MIN_SECONDS = 0.03
+"""Minimum time to compile a function that jax stores; by default a second, so no renderer is."""
+JAX_MIN_SECONDS_VARIABLE = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
 
 
 def cached_compile(
@@ -115,6 +118,8 @@ def share_with_jax() -> None:
     # jax from storing any other (jax issue 39880).
     if (folder := private_folder(JAX_FOLDER, most=JAX_MAX_FILES)) is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
+        if JAX_MIN_SECONDS_VARIABLE not in os.environ:
+            jax.config.update(JAX_MIN_SECONDS_VARIABLE.lower(), JAX_MIN_SECONDS)
 
 
 @contextmanager

@@ -48,7 +48,7 @@ def load_backend(
 ) -> Backend:
     """Return the true tabletop world, or a model's world that batches up to `batch` clips.
 
-    The model is compiled for all batch sizes now, over all devices, and stderr shows what is loaded
+    The model is compiled for all batch sizes now, over all devices. Stderr lists all that is loaded
     and compiled. Without `compile` it is compiled at the first step. `update_every` updates the
     state after each clip or, with a causal student, after each chunk of a clip.
     """
