@@ -113,7 +113,7 @@ def test_phases_end_with_their_work(capsys):
     assert capsys.readouterr().err == "loads\n"
 
 
-@pytest.mark.parametrize("name", ["debug", "tabletop", "tabletop_student"])
+@pytest.mark.parametrize("name", ["debug", "tabletop_student"])
 @pytest.mark.parametrize("streamed", [False, True])
 def test_the_number_of_programs_is_known_before_they_are_traced(name, streamed):
     config = configs.get(name)
