@@ -40,8 +40,7 @@ from egosim_jax.data.mixing import MIXTURE, read_mixture
 from egosim_jax.data.shards import ShardReader, ShardWriter, gather
 from egosim_jax.data.static import check_static
 from egosim_jax.generation.compiled import CompiledFn
-from egosim_jax.generation.encoding import Batch, batch_shapes, pack
-from egosim_jax.generation.generator import batches, targets_of
+from egosim_jax.generation.encoding import Batch, batch_shapes, batches, pack, targets_of
 from egosim_jax.io.bounded import listing, quote
 from egosim_jax.io.decoding import Decoding
 from egosim_jax.io.run import open_folder

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, closing
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -33,6 +33,7 @@ from egosim_jax.io.weights import hashes, place
 from egosim_jax.models.layers import LowRankParam, init_sharded
 from egosim_jax.models.lora import state_of as lora_state
 from egosim_jax.runtime.command import CommandExit, ExitCode
+from egosim_jax.runtime.phases import phase
 from egosim_jax.sharding import assemble, batch_sharding, make_mesh, parts, process_rows
 from egosim_jax.train.config import TrainConfig, numerics_only, resume_mutable
 from egosim_jax.train.distributed import count_distinct, is_preempted
@@ -83,7 +84,8 @@ def train(
     with jax.set_mesh(mesh), ExitStack() as stack:
         run = Run(task, training, programs, source, out, stack)
         run.compile()
-        state = run.start(weights, lora, teacher)
+        with phase0("loads the weights"):
+            state = run.start(weights, lora, teacher)
         log0(startup_message(state, training, out))
         for name, digest in (digests or {}).items():
             log0(f"{out}: from {name} sha256 {digest[:16]}")
@@ -150,7 +152,7 @@ class Run:
             with self.clock.phase("data"), closing(first):
                 example = self._to_devices(next(first))
             self.clock.flops = self.task.flops(self.training.batch_size)
-            with self.clock.phase("compile"):
+            with phase0("compiles the update"), self.clock.phase("compile"):
                 self.update = self.update.lower(self.programs.state, self.frozen, example).compile()
             seconds = self.clock.seconds["compile"]
             log0(f"compiled in {seconds:.1f} s{memory_summary(self.update)}")
@@ -364,6 +366,11 @@ def log0(text: str) -> None:
     """Print to stderr, in the first process only."""
     if is_first():
         print(text, file=sys.stderr, flush=True)
+
+
+def phase0(text: str) -> AbstractContextManager[None]:
+    """Return a phase in the first process, and an empty context in all others."""
+    return phase(text) if is_first() else nullcontext()
 
 
 def memory_summary(program: Any) -> str:

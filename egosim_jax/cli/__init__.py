@@ -3,6 +3,6 @@
 Commands check their options and call the other packages, which hold the work itself. Heavy modules
 are imported inside `run`, which keeps `egosim --help` fast.
 
-`main` in `__main__` runs the command. `comparison` has the options that `evaluate` and `table`
-share.
+`main` in `__main__` prints a first line and imports `commands`, which runs the command.
+`comparison` has the options that `evaluate` and `table` share.
 """

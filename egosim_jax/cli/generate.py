@@ -11,6 +11,7 @@ import tyro
 
 from egosim_jax.data.clip_files import Prompts
 from egosim_jax.runtime.command import ExitCode, HelpGroups
+from egosim_jax.runtime.phases import phase
 from egosim_jax.types import InputError, MeshConfig, check_counts, check_seed
 
 if TYPE_CHECKING:
@@ -112,11 +113,12 @@ class Generate:
 
     def run(self) -> int:
         """Check all options, compile and generate."""
-        from egosim_jax.generation.batch import BatchJob
-        from egosim_jax.io.executables import share_with_jax
-        from egosim_jax.worlds.tabletop.dataset import write_scenes
+        with phase(f"loads JAX and {self.config}"):
+            from egosim_jax.generation.batch import BatchJob
+            from egosim_jax.io.executables import share_with_jax
+            from egosim_jax.worlds.tabletop.dataset import write_scenes
 
-        self._check()
+            self._check()
         share_with_jax()
         job = BatchJob(
             model=self._model(),
@@ -139,14 +141,15 @@ class Generate:
             seeds = range(self.seed, self.seed + (self.limit or 1))
             kind = "robot" if self.robot else "human"
             static = job.model.layout.mask_packing == "observed"
-            scenes = write_scenes(
-                job.out / "scenes",
-                seeds,
-                spec=job.model.video,
-                kind=kind,
-                prior="static" if static else "state",
-                hands="mesh" if static else "skeleton",
-            )
+            with phase(f"makes {len(seeds)} scenes of the tabletop world"):
+                scenes = write_scenes(
+                    job.out / "scenes",
+                    seeds,
+                    spec=job.model.video,
+                    kind=kind,
+                    prior="static" if static else "state",
+                    hands="mesh" if static else "skeleton",
+                )
             windows = self._windows(scenes)
         outcome = job.generate(windows)
         if outcome.rejected == len(windows):

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from egosim_jax.runtime.command import ExitCode
+from egosim_jax.runtime.phases import phase
 from egosim_jax.types import InputError, check_counts, check_seed
 
 if TYPE_CHECKING:
@@ -64,25 +65,21 @@ class Play:
         check_counts({"--steps": self.steps})
         check_seed(self.seed, name="--seed")
         self._check_port()
-        from egosim_jax import configs
-        from egosim_jax.generation.generator import Generator
-        from egosim_jax.interactive.env.action_spec import ActionSpec
-        from egosim_jax.interactive.env.backends import GeneratedWorld
-        from egosim_jax.interactive.play.played_episode import PlayedEpisode
-        from egosim_jax.interactive.play.viewer import Page
-        from egosim_jax.io.atomic import lock_folder
-        from egosim_jax.io.executables import share_with_jax
-        from egosim_jax.simulation.simulator import check_update_every
+        with phase(f"loads JAX and {self.config}"):
+            from egosim_jax import configs
+            from egosim_jax.generation.generator import Generator
+            from egosim_jax.interactive.env.action_spec import ActionSpec
+            from egosim_jax.interactive.env.backends import GeneratedWorld
+            from egosim_jax.interactive.play.played_episode import PlayedEpisode
+            from egosim_jax.interactive.play.viewer import Page
+            from egosim_jax.io.atomic import lock_folder
+            from egosim_jax.io.executables import share_with_jax
+            from egosim_jax.simulation.simulator import check_update_every
 
         share_with_jax()
         config = configs.get(self.config)
         config = replace(config, steps=self.steps or config.steps)
         check_update_every(self.update_every, config.chunk_frames, config.name, self.perception)
-        print(
-            f"loading and compiling {self.config}: the first start takes minutes",
-            file=sys.stderr,
-            flush=True,
-        )
         weights = configs.weights_of(self.config, self.weights)
         generator = Generator.load(config, weights)
         world = GeneratedWorld(
@@ -93,7 +90,8 @@ class Play:
             update_every=self.update_every,
         )
         spec = ActionSpec(sides=(self.hand,), camera=True)
-        start = self._start(world, spec)
+        with phase("makes the scene"):
+            start = self._start(world, spec)
         if note := configs.scene_warning(world.trained_on, start.state.provenance):
             print(note, file=sys.stderr, flush=True)
         generator.compile(1, streamed=True)
@@ -103,7 +101,8 @@ class Play:
             return PlayedEpisode(world, self.out, world.start(seed, spec), self.hand)
 
         with lock_folder(self.out):
-            server = self._serve()
+            with phase("opens the page"):
+                server = self._serve()
             Page(server, begin, PlayedEpisode(world, self.out, start, self.hand))
             print(f"http://127.0.0.1:{server.get_port()}", flush=True)
             _wait()

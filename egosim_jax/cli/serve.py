@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import sys
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from egosim_jax.runtime.command import ExitCode, HelpGroups
+from egosim_jax.runtime.phases import phase
 from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:
@@ -92,17 +92,11 @@ class Serve:
         check_counts({"--batch": self.batch, "--steps": self.steps, "--threads": self.threads})
         if not 0 <= self.port < 1 << 16:
             raise InputError(f"--port must be from 0 to 65535, not {self.port}.")
-        from egosim_jax.interactive.server.server import bind, serve
+        with phase("loads JAX and the server"):
+            from egosim_jax.interactive.server.server import bind, serve
 
         token = os.environ.get(TOKEN, "").strip() or None
         with bind(self.host, self.port, token=token) as bound:
-            made = f", compiled for batches of up to {self.batch}" if self.world != "true" else ""
-            print(
-                f"loading the {self.world} world of {self.config}{made}: the first start takes "
-                "minutes",
-                file=sys.stderr,
-                flush=True,
-            )
             service = self._service()
             finished = True
             try:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
 
 from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.geometry import up_of
@@ -16,13 +18,15 @@ from egosim_jax.rendering import RendererName
 from egosim_jax.rendering.portrait import write_portrait
 from egosim_jax.rendering.rerun_log import RECORDING, Recording
 from egosim_jax.runtime.command import ExitCode, HelpGroups
+from egosim_jax.runtime.phases import phase
 from egosim_jax.runtime.terminal import printable
-from egosim_jax.types import InputError, VideoSpec, check_counts, check_seed
+from egosim_jax.types import InputError, Kind, VideoSpec, check_counts, check_seed
 
 if TYPE_CHECKING:
     from egosim_jax.simulation.episode import Episode
     from egosim_jax.simulation.simulator import Simulator, Step
     from egosim_jax.types import Action, GroundTruth, SceneState
+    from egosim_jax.worlds.tabletop import TabletopClip
 
 SHEET_FRAMES = 6
 """Number of frames of each video on a contact sheet."""
@@ -77,19 +81,6 @@ class Simulate:
 
     def run(self) -> int:
         """Simulate; write videos, states and scores."""
-        from egosim_jax import configs, rendering
-        from egosim_jax.evaluation.metrics.loop import DEFINITIONS
-        from egosim_jax.generation.generator import Generator
-        from egosim_jax.io.digest import fingerprint
-        from egosim_jax.io.executables import share_with_jax
-        from egosim_jax.io.journal import Journal
-        from egosim_jax.io.run import open_folder, write_json
-        from egosim_jax.io.weights import hashes
-        from egosim_jax.perception import registry
-        from egosim_jax.perception.recorded import RecordedConfig
-        from egosim_jax.simulation.rollout import OUTPUTS, Rollout
-        from egosim_jax.simulation.simulator import Simulator, check_update_every
-
         check_counts({"--clips": self.clips, "--steps": self.steps})
         check_seed(self.seed)
         if self.update == "none" and self.perception != Simulate.perception:
@@ -97,16 +88,32 @@ class Simulate:
                 f"--perception {self.perception} has no effect with --update none: give --update "
                 "full, or omit this option."
             )
+        with phase(f"loads JAX and {self.config}"):
+            from egosim_jax import configs, rendering
+            from egosim_jax.evaluation.metrics.loop import DEFINITIONS
+            from egosim_jax.generation.generator import Generator
+            from egosim_jax.io.digest import fingerprint
+            from egosim_jax.io.executables import share_with_jax
+            from egosim_jax.io.journal import Journal
+            from egosim_jax.io.run import open_folder, write_json
+            from egosim_jax.io.weights import hashes
+            from egosim_jax.perception import registry
+            from egosim_jax.perception.recorded import RecordedConfig
+            from egosim_jax.simulation.rollout import OUTPUTS, Rollout
+            from egosim_jax.simulation.simulator import Simulator, check_update_every
+
         share_with_jax()
         config = configs.get(self.config)
         config = replace(config, steps=self.steps or config.steps)
         weights = configs.weights_of(self.config, self.weights)
         check_update_every(self.update_every, config.chunk_frames, config.name, self.perception)
         folder = self.out or Path("runs") / f"simulate_{self.seed}"
-        episode = self._episode(config.video)
+        pipeline = registry.parse(self.perception) if self.update == "full" else None
+        reads = pipeline is not None and registry.reads_ground_truth(pipeline)
+        with phase(f"loads {self.episode}" if self.episode else "makes the tabletop scene"):
+            episode = self._episode(config.video, with_ground_truth=reads)
         perception = None
-        if self.update == "full":
-            pipeline = registry.parse(self.perception)
+        if pipeline is not None:
             if isinstance(pipeline, RecordedConfig):
                 pipeline.check_clips(len(episode.actions))
             perception = pipeline.build(episode.observations())
@@ -116,20 +123,21 @@ class Simulate:
             "weights": hashes(weights, student=config.chunks is not None),
             "episode": fingerprint(episode),
         }
-        Journal(folder, outputs=OUTPUTS)  # refuses a damaged journal before the weights are loaded
+        journal = Journal(folder, outputs=OUTPUTS)  # a damaged one is refused before the weights
         free = ["simulate.weights", "simulate.first_frame", "simulate.episode"]
         open_folder(folder, made_of, mutable=free)
-        print(
-            f"{folder}: {len(episode.actions)} clips by {self.config}; the first one waits until "
-            "the model is compiled",
-            file=sys.stderr,
-            flush=True,
-        )
+        count = len(episode.actions)
+        print(f"{folder}: {count} clips by {self.config}", file=sys.stderr, flush=True)
         made_on = configs.trained_on(self.config, weights)
         if note := configs.scene_warning(made_on, episode.state.provenance):
             print(note, file=sys.stderr, flush=True)
+        outputs = _Outputs(folder, episode)
+        generator = Generator.load(config, weights, renderer=rendering.get(self.renderer))
+        if f"{count} generate" not in journal.done:
+            generator.compile(1, streamed=True)
         simulator = Simulator(
-            generator=Generator.load(config, weights, renderer=rendering.get(self.renderer)),
+            show=outputs.show,
+            generator=generator,
             perception=perception,
             fps=config.video.fps,
             update_every=self.update_every,
@@ -137,15 +145,20 @@ class Simulate:
         steps = Rollout(simulator, folder).run(
             episode.state, episode.actions, seed=self.seed, first_frame=episode.first_frame
         )
-        report = _Outputs(folder, episode, simulator).write(steps)
+        truths = self._ground_truth(episode, config.video)
+        report = outputs.write(simulator, steps, truths)
         write_json(folder / "report.json", {"definitions": DEFINITIONS, "clips": report})
-        if episode.ground_truth:
+        if self.episode is None or episode.ground_truth:
             _print(report)
         print(folder / "contact_sheet.png")
         return ExitCode.DONE
 
-    def _episode(self, video: VideoSpec) -> Episode:
-        """Return the episode to simulate, with the chosen clips and first frame."""
+    def _episode(self, video: VideoSpec, *, with_ground_truth: bool) -> Episode:
+        """Return the episode to simulate, with the chosen clips and first frame.
+
+        The tabletop world renders its ground truth only on request; `_ground_truth` renders it
+        clip by clip.
+        """
         from egosim_jax.simulation.episode import Episode
 
         if self.episode is not None:
@@ -154,11 +167,13 @@ class Simulate:
             episode = Episode.load(self.episode)
             check_fits(episode, video, self.config)
         else:
-            from egosim_jax.worlds.tabletop import make_sequence, to_episode
+            from egosim_jax.worlds.tabletop import episode_of_sequence, to_episode
 
-            kind = "robot" if self.robot else "human"
-            clips = make_sequence(self.seed, spec=video, clips=self.clips or CLIPS, kind=kind)
-            episode = to_episode(list(clips), fps=video.fps)
+            if with_ground_truth:
+                episode = to_episode(list(self._rendered(video)), fps=video.fps)
+            else:
+                count, kind = self.clips or CLIPS, self._kind
+                episode = episode_of_sequence(self.seed, spec=video, clips=count, kind=kind)
         if self.clips is not None and self.clips > len(episode.actions):
             raise InputError(
                 f"{self.episode} has {len(episode.actions)} clips, not {self.clips}. (--clips)"
@@ -181,6 +196,27 @@ class Simulate:
             )
         return replace(episode, first_frame=image)
 
+    @property
+    def _kind(self) -> Kind:
+        return "robot" if self.robot else "human"
+
+    def _rendered(self, video: VideoSpec) -> Iterator[TabletopClip]:
+        """Yield the clips of the tabletop world, each rendered when it is asked for."""
+        from egosim_jax.worlds.tabletop import make_sequence
+
+        count, kind = self.clips or CLIPS, self._kind
+        return make_sequence(self.seed, spec=video, clips=count, kind=kind)
+
+    def _ground_truth(
+        self, episode: Episode, video: VideoSpec
+    ) -> Iterable[GroundTruth] | Iterable[None]:
+        """Return the ground truth of each clip, as far as it is known."""
+        from egosim_jax.worlds.tabletop import to_known
+
+        if self.episode is None and not episode.ground_truth:
+            return map(to_known, self._rendered(video))
+        return episode.ground_truth or (None,) * len(episode.actions)
+
 
 def check_fits(episode: Episode, video: VideoSpec, config: str) -> None:
     """Raise `InputError` unless an episode has the length, size and rate of a model's clips."""
@@ -199,37 +235,56 @@ def sheet_moments(frames: int) -> list[int]:
     return [(frames - 1) * k // (SHEET_FRAMES - 1) for k in range(SHEET_FRAMES)]
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Outputs:
     """Writer of a simulation's videos, states, contact sheet and recording."""
 
     folder: Path
     episode: Episode
-    simulator: Simulator
+    number: int = 1
+    """Number of the clip in progress."""
+    shown: list[np.ndarray] = field(default_factory=list)
+    """Frames of the clip in progress, in groups."""
 
-    def write(self, steps: Iterator[Step]) -> list[dict[str, Any]]:
+    def show(self, frames: np.ndarray) -> None:
+        """Write the video of a clip once its last frame is decoded, before it is perceived."""
+        self.shown.append(frames)
+        if sum(map(len, self.shown)) == self.episode.shape[0]:
+            self._write_clip(np.concatenate(self.shown))
+
+    def _write_clip(self, frames: np.ndarray) -> None:
+        from egosim_jax.io.video import write_video
+
+        path = self.folder / f"clip_{self.number}.mp4"
+        write_video(path, frames, self.episode.fps)
+        print(path, flush=True)
+
+    def write(
+        self, simulator: Simulator, steps: Iterator[Step], truths: Iterable[GroundTruth | None]
+    ) -> list[dict[str, Any]]:
         """Write every step; return the report, one entry per clip."""
         folder, state, up = self.folder, self.episode.state, up_of(self.episode.state)
         recording = None
-        if find_spec("rerun"):
-            recording = Recording(folder / RECORDING, folder.name, up=up)
-        truths = self.episode.ground_truth or (None,) * len(self.episode.actions)
         report, sheet = [], []
-        self._write_state(0, state)
         then = time.monotonic()
-        for number, (step, action, truth) in enumerate(
-            zip(steps, self.episode.actions, truths, strict=True), start=1
-        ):
-            report.append(
-                {
-                    "clip": number,
-                    "action": action.prompt,
-                    "notes": list(step.notes),
-                    **({} if step.latency is None else asdict(step.latency)),
-                    **self._score(step, action, truth),
-                }
-            )
-            sheet.append(self._write_step(number, step, action, truth))
+        for step, action, truth in zip(steps, self.episode.actions, truths, strict=True):
+            if not self.shown:  # the clip was made before an interrupt
+                self._write_clip(step.clip.frames)
+            if self.number == 1:  # not before: the first clip would have to wait
+                self._write_state(0, state)
+                if find_spec("rerun"):
+                    recording = Recording(folder / RECORDING, folder.name, up=up)
+            with phase(f"clip {self.number}: scores and draws", only_if_long=True):
+                report.append(
+                    {
+                        "clip": self.number,
+                        "action": action.prompt,
+                        "notes": list(step.notes),
+                        **({} if step.latency is None else asdict(step.latency)),
+                        **_score(simulator, step, action, truth),
+                    }
+                )
+                sheet.append(self._write_step(simulator, step, action, truth))
             if recording is not None:
                 recording.add(
                     state,
@@ -239,55 +294,39 @@ class _Outputs:
                     ground_truth=truth and truth.frames,
                 )
             state = step.state
-            print(folder / f"clip_{number}.mp4")
-            about = f"clip {number}/{len(truths)}: {action.prompt}"
-            times = f"{time.monotonic() - then:.1f} s"
-            if step.latency is not None:
-                first, last = step.latency.first_frame_s, step.latency.last_frame_s
-                times += f"; first frame after {first:.1f} s, last after {last:.1f} s"
-            print(printable(f"{about} ({times})"), file=sys.stderr)
-            for note in step.notes:
-                print(printable(f"  {note}"), file=sys.stderr)
-            then = time.monotonic()
+            self._print_step(step, action, seconds=time.monotonic() - then)
+            self.number, self.shown, then = self.number + 1, [], time.monotonic()
         if recording is not None:
             recording.close(state)
         moments = sheet_moments(self.episode.shape[0])
         draw_sheet(sheet, folder / "contact_sheet.png", moments=moments)
         return report
 
-    def _score(self, step: Step, action: Action, truth: GroundTruth | None) -> dict[str, float]:
-        if truth is None:
-            return {}
-        from egosim_jax.evaluation.metrics.loop import score_step
-
-        return score_step(
-            step.clip.frames,
-            truth,
-            cameras=action.cameras,
-            before=step.view,
-            after=self.simulator.render(step.state, action),
-        )
+    def _print_step(self, step: Step, action: Action, *, seconds: float) -> None:
+        about = f"clip {self.number}/{len(self.episode.actions)}: {action.prompt}"
+        times = f"{seconds:.1f} s"
+        if step.latency is not None:
+            first, last = step.latency.first_frame_s, step.latency.last_frame_s
+            times += f"; first frame after {first:.1f} s, last after {last:.1f} s"
+        print(printable(f"{about} ({times})"), file=sys.stderr)
+        for note in step.notes:
+            print(printable(f"  {note}"), file=sys.stderr)
 
     def _write_step(
-        self, number: int, step: Step, action: Action, truth: GroundTruth | None
+        self, simulator: Simulator, step: Step, action: Action, truth: GroundTruth | None
     ) -> SheetClip:
-        """Write the videos and the state of one step; return its part of the contact sheet."""
-        import numpy as np
-
+        """Write videos and state of one step; return its part of the contact sheet."""
         from egosim_jax.io.video import write_video
 
-        renderer = self.simulator.renderer
-        hands = renderer.draw_hands(action.joints_m, action.cameras, kind=action.kind)[0]
+        hands = simulator.renderer.draw_hands(action.joints_m, action.cameras, kind=action.kind)[0]
         videos = {"view": step.view.frames, "hands": hands, "generated": step.clip.frames}
         if truth is not None:
             videos["ground truth"] = truth.frames
         side_by_side = np.concatenate(list(videos.values()), axis=2)
-        name, fps = f"clip_{number}", step.clip.fps
-        write_video(self.folder / f"{name}.mp4", step.clip.frames, fps)
-        write_video(self.folder / f"{name}_cmp.mp4", side_by_side, fps)
-        self._write_state(number, step.state)
+        write_video(self.folder / f"clip_{self.number}_cmp.mp4", side_by_side, step.clip.fps)
+        self._write_state(self.number, step.state)
         return SheetClip(
-            f"{number}: {action.prompt}   ({', '.join(videos)})", list(videos.values())
+            f"{self.number}: {action.prompt}   ({', '.join(videos)})", list(videos.values())
         )
 
     def _write_state(self, number: int, state: SceneState) -> None:
@@ -296,6 +335,22 @@ class _Outputs:
         write_ply(self.folder / f"state_{number}.ply", state)
         up = up_of(self.episode.state)
         write_portrait(self.folder / f"state_{number}.png", state, up=up)
+
+
+def _score(
+    simulator: Simulator, step: Step, action: Action, truth: GroundTruth | None
+) -> dict[str, float]:
+    if truth is None:
+        return {}
+    from egosim_jax.evaluation.metrics.loop import score_step
+
+    return score_step(
+        step.clip.frames,
+        truth,
+        cameras=action.cameras,
+        before=step.view,
+        after=simulator.render(step.state, action),
+    )
 
 
 def _print(report: Sequence[Mapping[str, Any]]) -> None:

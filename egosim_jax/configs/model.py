@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -22,6 +23,7 @@ from egosim_jax.diffusion.process import RectifiedFlow, VariancePreserving
 from egosim_jax.diffusion.solver import DDIM, Euler
 from egosim_jax.diffusion.unipc import UniPC
 from egosim_jax.io import weights
+from egosim_jax.io.executables import cached_trace
 from egosim_jax.models import (
     CausalDenoiserConfig,
     ChunkedCodecConfig,
@@ -315,7 +317,7 @@ class Networks(nnx.Module):
         """Build the networks with shapes in place of weights."""
         return cls(
             **{
-                name: abstract(network)
+                name: cached_trace(("abstract", network), partial(abstract, network))
                 for name, network in config.networks.items()
                 if only is None or name in only
             }

@@ -39,7 +39,7 @@ from egosim_jax.experiments.dwm_variants import (
     with_layout,
 )
 from egosim_jax.experiments.training import make_frames, train_config, train_denoiser
-from egosim_jax.generation.generator import batches
+from egosim_jax.generation.encoding import batches
 from egosim_jax.io import weights
 from egosim_jax.io.mapped import read_safetensors
 from egosim_jax.rendering.mesh import hand_mask

@@ -17,7 +17,8 @@ from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.evaluation.metrics import rank_correlation, region
 from egosim_jax.evaluation.metrics.report import Summary, print_table
 from egosim_jax.experiments.config import Policies
-from egosim_jax.generation.generator import Generator, batches
+from egosim_jax.generation.encoding import batches
+from egosim_jax.generation.generator import Generator
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.bounded import read_json
 from egosim_jax.io.run import write_json

@@ -13,7 +13,8 @@ from egosim_jax.configs.model import ModelConfig
 from egosim_jax.data.sheet import SheetClip
 from egosim_jax.evaluation.metrics import lpips, region
 from egosim_jax.evaluation.metrics.report import score
-from egosim_jax.generation.generator import Generator, batches
+from egosim_jax.generation.encoding import batches
+from egosim_jax.generation.generator import Generator
 from egosim_jax.types import Kind, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, to_triplet
 from egosim_jax.worlds.tabletop.clips import POINT_PX, HandsName, PriorName

@@ -30,7 +30,8 @@ from egosim_jax.data.clips import Policy, check_clip, load_triplet
 from egosim_jax.data.metadata import check_presence
 from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.data.windows import RESULTS, Window, conditions_sha256, read_results
-from egosim_jax.generation.generator import Generator, batches
+from egosim_jax.generation.encoding import batches
+from egosim_jax.generation.generator import Generator
 from egosim_jax.generation.stream import NonFiniteError
 from egosim_jax.io.atomic import append_line
 from egosim_jax.io.bounded import listing, quote
@@ -40,6 +41,7 @@ from egosim_jax.io.run import open_folder
 from egosim_jax.io.video import read_video, write_video
 from egosim_jax.io.weights import hashes
 from egosim_jax.rendering.mesh import hand_mask
+from egosim_jax.runtime.phases import phase
 from egosim_jax.runtime.terminal import printable
 from egosim_jax.sharding import check_batch, make_mesh, parts
 from egosim_jax.types import Clip, InputError, MeshConfig, Triplet
@@ -275,7 +277,8 @@ class BatchJob:
             triplets, problems = self._load(batch)
             failed += problems
             if triplets:
-                failed += self._generate_batch(generator, triplets, size)
+                with phase(f"generates {len(triplets)} clips", only_if_long=True):
+                    failed += self._generate_batch(generator, triplets, size)
             done += len(batch)
             left = (time.monotonic() - began) / done * (len(windows) - done)
             print(

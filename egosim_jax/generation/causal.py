@@ -159,6 +159,10 @@ class ChunkDenoiser:
             yield f"chunk {number + 1}", program, given
             _, cache = program.shapes(*given)
 
+    def count_programs(self) -> int:
+        """Return the number of `programs`, without tracing any."""
+        return 1 + len(self.chunks.sizes)
+
     def latents(
         self,
         text: Float[Any, "b n d"],

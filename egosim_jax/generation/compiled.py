@@ -12,6 +12,7 @@ from flax import nnx
 from jax.sharding import Mesh, NamedSharding
 
 from egosim_jax.io.executables import cached_compile
+from egosim_jax.runtime.phases import phase
 from egosim_jax.sharding import check_batch, spec
 
 Axes = tuple[str | None, ...]
@@ -55,19 +56,23 @@ class CompiledFn:
         with self._on_mesh():
             return self._jit.trace(self._params, *self._placed(args))
 
-    def compile(self, *args: Any) -> Any:
-        """Compile for these arguments, arrays or shapes, or load it from the cache."""
+    def compile(self, *args: Any, about: str = "") -> Any:
+        """Compile for these arguments, arrays or shapes, or load it from the cache.
+
+        `about` names the function to the user, by default by its cache key.
+        """
         placed = self._placed(args)
 
         def compile() -> Any:
             return self._jit.lower(self._params, *placed).compile()
 
         with self._on_mesh():
-            compiled = (
-                compile()
-                if self._cache_key is None
-                else cached_compile(self._cache_key, (self._params, placed), compile)
-            )
+            if self._cache_key is None:
+                with phase("compiles a function"):
+                    compiled = compile()
+            else:
+                given, about = (self._params, placed), about or self._cache_key[0]
+                compiled = cached_compile(self._cache_key, given, compile, about=about)
         self._compiled[_signature(args)] = compiled
         return compiled
 

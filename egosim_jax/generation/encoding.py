@@ -8,13 +8,13 @@ Training reads batches of latents shards, in which some arrays are encoded alrea
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Key, UInt32
+from jaxtyping import Array, Key, UInt8, UInt32
 
 from egosim_jax.conditioning.condition import Condition
 from egosim_jax.conditioning.pixels import clip_pixels, to_model
@@ -29,6 +29,7 @@ from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.sharding import replicate_params
 from egosim_jax.types import InputError, Triplet
 
+T = TypeVar("T")
 Batch = Mapping[str, Any]
 """Arrays of a batch of clips, by name; arrays that a model does not use are absent.
 
@@ -189,3 +190,17 @@ def last_32_bits(seeds: Sequence[int]) -> UInt32[np.ndarray, " b"]:
 def keys_for(seeds: Array, use: int) -> Key[Array, " b"]:
     """Return a key of each seed for one of its uses, such as `SOLVER_NOISE`."""
     return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed), use))(seeds)
+
+
+def batches(items: Sequence[T], size: int) -> Iterator[Sequence[T]]:
+    """Yield the items in batches of `size`; the last one may be smaller."""
+    for first in range(0, len(items), size):
+        yield items[first : first + size]
+
+
+def targets_of(triplets: Sequence[Triplet]) -> UInt8[np.ndarray, "b f h w 3"]:
+    """Return the target videos. Raises `InputError` naming the clips without one."""
+    without = [t.video_id for t in triplets if t.target is None]
+    if without:
+        raise InputError(f"{', '.join(without)}: no target to encode. (column video)")
+    return np.stack([t.target for t in triplets if t.target is not None])

@@ -46,6 +46,7 @@ from egosim_jax.generation.encoding import (
     keys_for,
     last_32_bits,
     pack,
+    targets_of,
 )
 from egosim_jax.generation.stream import (
     CausalCodec,
@@ -59,6 +60,7 @@ from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.run import plain
 from egosim_jax.models import CausalDenoiser, Denoiser
 from egosim_jax.rendering import Renderer, jitted
+from egosim_jax.runtime.phases import phase
 from egosim_jax.sharding import fetch, shard_params
 from egosim_jax.types import (
     Action,
@@ -200,7 +202,8 @@ class Generator:
 
         config = configs.get(config) if isinstance(config, str) else config
         folder = configs.weights_of(config.name, None if weights is None else Path(weights))
-        networks = Networks.load(config, folder, mesh=mesh)
+        with phase(f"loads the weights of {config.name}"):
+            networks = Networks.load(config, folder, mesh=mesh)
         if lora is not None:
             from egosim_jax.convert.lora import check_base, read_lora
             from egosim_jax.io.weights import hashes
@@ -243,8 +246,18 @@ class Generator:
 
     def compile(self, batch: int, *, streamed: bool = False) -> None:
         """Compile all functions of `generate`, or of `groups`, for batches of this size."""
-        for _, program, inputs in self.programs(batch, streamed=streamed):
-            program.compile(*inputs)
+        count = self.count_programs(streamed=streamed)
+        programs = self.programs(batch, streamed=streamed)
+        for number, (name, program, inputs) in enumerate(programs, start=1):
+            program.compile(*inputs, about=f"{number} of {count}: {name}")
+
+    def count_programs(self, *, streamed: bool = False) -> int:
+        """Return the number of `programs`, without tracing any."""
+        codec, whole = self.codec, self.denoiser is None
+        count = 3 if self.denoiser is None else 2 + self.denoiser.count_programs()
+        if codec is None or (whole and not streamed):
+            return count + 1
+        return count + (0 if whole else len(codec.encoded_chunks(1))) + codec.count_decoders()
 
     def generate(
         self,
@@ -401,17 +414,3 @@ class Generator:
 
     def _clips(self, frames: UInt8[np.ndarray, "b f h w 3"]) -> list[Clip]:
         return [Clip(frames=video, fps=self.config.video.fps) for video in frames]
-
-
-def batches(items: Sequence[T], size: int) -> Iterator[Sequence[T]]:
-    """Yield the items in batches of `size`; the last one may be smaller."""
-    for first in range(0, len(items), size):
-        yield items[first : first + size]
-
-
-def targets_of(triplets: Sequence[Triplet]) -> UInt8[np.ndarray, "b f h w 3"]:
-    """Return the target videos. Raises `InputError` naming the clips without one."""
-    without = [t.video_id for t in triplets if t.target is None]
-    if without:
-        raise InputError(f"{', '.join(without)}: no target to encode. (column video)")
-    return np.stack([t.target for t in triplets if t.target is not None])

@@ -91,16 +91,26 @@ class CodecPrograms:
 
     def encode_programs(self, batch: int) -> Iterator[tuple[str, CompiledFn, tuple]]:
         """Yield name, function and input shapes of each program of `encode`."""
-        caches, known = None, set()
-        for number, frames in enumerate(self.config.chunk_frames):
-            videos = video_shapes(batch, self.config, number)
-            videos.pop("mask", None)
-            if not videos or (kind := (frames, number > 0)) in known:
-                continue
-            known.add(kind)
+        caches = None
+        for number, videos in self.encoded_chunks(batch).items():
             yield f"encode chunk {number + 1}", self._encode, (videos, caches)
             if number == 0:  # later chunks leave caches of equal shapes
                 caches = self._encode.shapes(videos, caches)[1]
+
+    def encoded_chunks(self, batch: int) -> dict[int, dict[str, Any]]:
+        """Return the shapes of the videos of each chunk that needs its own program of `encode`."""
+        found, known = {}, set()
+        for number, frames in enumerate(self.config.chunk_frames):
+            videos = video_shapes(batch, self.config, number)
+            videos.pop("mask", None)
+            if videos and (kind := (frames, number > 0)) not in known:
+                known.add(kind)
+                found[number] = videos
+        return found
+
+    def count_decoders(self) -> int:
+        """Return the number of `decode_programs`, without tracing any."""
+        return min(self.config.latent_shape[0], 2)
 
     def decode_programs(self, batch: int) -> Iterator[tuple[str, CompiledFn, tuple]]:
         """Yield name, function and input shapes of each program of `decode`."""

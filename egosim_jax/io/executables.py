@@ -1,4 +1,4 @@
-"""Persistent cache of compiled functions, which then run without tracing or compiling.
+"""Persistent cache of compiled functions and traced networks, which need no trace or compilation.
 
 The files are in a `PrivateCache`, because reading one runs native code in it. Its key is the digest
 of everything that the compiled function depends on: its name and config, the shapes of its
@@ -18,7 +18,7 @@ import pickle
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from typing import Any
 import jax
 
 from egosim_jax.io.private import PrivateCache, private_folder
+from egosim_jax.runtime.phases import phase
 
 PACKAGE = Path(__file__).parents[1]
 LIBRARIES = ("jax", "jaxlib", "flax")
@@ -36,41 +37,74 @@ TRACED = (
     "generation/stream.py", "models", "sharding.py", "types",
 )  # fmt: skip
 """Modules that run while a function is traced, and so determine the compiled program."""
-FOLDER, MAX_FILES = "executables", 64
-"""Name of the cache, and its maximum number of compiled functions."""
+FOLDER, MAX_FILES = "executables", 128
+"""Name of the cache, and its maximum number of compiled functions and traced networks."""
 JAX_FOLDER, JAX_MAX_FILES = "jax", 1024
 """Name of jax's own compilation cache, and the number of files that a start leaves in it."""
+JAX_MIN_SECONDS = 0.03
+"""Minimum time to compile a function that jax stores; by default a second, so no renderer is."""
+JAX_MIN_SECONDS_VARIABLE = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
 
 
-def cached_compile(key: Any, args: Any, compile_fn: Callable[[], Any]) -> Any:
+def cached_compile(
+    key: Any, args: Any, compile_fn: Callable[[], Any], *, about: str = "a function"
+) -> Any:
     """Return the compiled function of this key and these arguments, from the cache if it is there.
 
-    `args` are arrays or shapes. Without a private folder, with several processes, or with a class
-    in the key whose source is not in a file, it is compiled and not stored.
+    `args` are arrays or shapes; `about` names the function to the user. Without a private folder,
+    with several processes, or with a class in the key whose source is not in a file, it is compiled
+    and not stored.
     """
     from jax.experimental import serialize_executable
 
     sources = _sources(key)
-    if sources is None or jax.process_count() > 1:
-        return compile_fn()
-    if (cache := PrivateCache.open(FOLDER, most=MAX_FILES)) is None:
-        return compile_fn()
+    alone = sources is not None and jax.process_count() == 1
+    cache = PrivateCache.open(FOLDER, most=MAX_FILES) if alone else None
+    if cache is None:
+        with phase(f"compiles {about}"):
+            return compile_fn()
     name = _digest((key, sources), args)
     if (data := cache.get(name)) is not None:
         try:
-            return serialize_executable.deserialize_and_load(
-                *pickle.loads(data),  # noqa: S301
-                execution_devices=_devices(args),
-            )
+            with phase(f"loads {about}", only_if_long=True):
+                return serialize_executable.deserialize_and_load(
+                    *pickle.loads(data),  # noqa: S301
+                    execution_devices=_devices(args),
+                )
         except Exception as error:  # whatever is wrong with it, it can be compiled again
-            warnings.warn(f"{name} cannot be used and is compiled again: {error}", stacklevel=2)
-    with _without_jax_cache():
+            _warn_unusable(name, error)
+    with phase(f"compiles {about}; cached next time"), _without_jax_cache():
         compiled = compile_fn()
     try:
         cache.put(name, pickle.dumps(serialize_executable.serialize(compiled)))
     except (ValueError, NotImplementedError) as error:  # cannot be serialized
         warnings.warn(f"{name} was not stored: {error}", stacklevel=2)
     return compiled
+
+
+def cached_trace(key: Any, trace_fn: Callable[[], Any]) -> Any:
+    """Return the network of shapes that is traced from a key, from the cache if it is there.
+
+    It depends only on the key and the code. It is not stored if `cached_compile` would not store
+    with this key, or if it holds a function that has no importable name.
+    """
+    sources = _sources(key)
+    if sources is None or (cache := PrivateCache.open(FOLDER, most=MAX_FILES)) is None:
+        return trace_fn()
+    name = _hash({"key": repr((key, sources)), **_libraries()})
+    if (data := cache.get(name)) is not None:
+        try:
+            return pickle.loads(data)  # noqa: S301
+        except Exception as error:  # whatever is wrong with it, it can be traced again
+            _warn_unusable(name, error)
+    traced = trace_fn()
+    with suppress(pickle.PicklingError, AttributeError, TypeError):
+        cache.put(name, pickle.dumps(traced))
+    return traced
+
+
+def _warn_unusable(name: str, error: Exception) -> None:
+    warnings.warn(f"{name} cannot be used and is made again: {error}", stacklevel=3)
 
 
 def share_with_jax() -> None:
@@ -84,6 +118,8 @@ def share_with_jax() -> None:
     # jax from storing any other (jax issue 39880).
     if (folder := private_folder(JAX_FOLDER, most=JAX_MAX_FILES)) is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
+        if JAX_MIN_SECONDS_VARIABLE not in os.environ:
+            jax.config.update(JAX_MIN_SECONDS_VARIABLE.lower(), JAX_MIN_SECONDS)
 
 
 @contextmanager
@@ -116,11 +152,19 @@ def _digest(key: Any, args: Any) -> str:
         "devices": [devices[0].device_kind, len(devices), devices[0].client.platform_version],
         "precision": jax.config.values["jax_default_matmul_precision"],
         "wide": jax.config.values["jax_enable_x64"],
-        "versions": [metadata.version(name) for name in LIBRARIES],
         "variables": [os.environ.get(name) for name in VARIABLES],
         "processor": _processor(),
-        "code": _code(),
+        **_libraries(),
     }
+    return _hash(parts)
+
+
+def _libraries() -> dict[str, Any]:
+    """Return the versions of the libraries and the digest of the code."""
+    return {"versions": [metadata.version(name) for name in LIBRARIES], "code": _code()}
+
+
+def _hash(parts: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 

@@ -93,7 +93,6 @@ def fill(
     if problems:
         raise WeightsError(problems, source=source)
     import jax
-    import jax.numpy as jnp
     from flax import nnx
 
     from egosim_jax.sharding import state_sharding
@@ -104,7 +103,8 @@ def fill(
         tensor = tensors[".".join(map(str, path))]
         tensor = tensor.array() if isinstance(tensor, Tensor) else tensor
         if mesh is None:
-            value = jnp.array(tensor)  # a copy: the file may be mapped
+            # A copy, since the file may be mapped; `jnp.array` would compile one for each shape.
+            value = jax.device_put(np.array(tensor))
         else:
             value = jax.make_array_from_callback(
                 tensor.shape, where[path].get_value(), lambda part, t=tensor: np.array(t[part])

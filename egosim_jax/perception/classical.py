@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -94,6 +95,7 @@ class MovedObjects:
 class ClassicalConfig:
     """Perception without network weights, for clips with known cameras and hands."""
 
+    reads_ground_truth: ClassVar[bool] = False
     hands: HandMasks = field(default_factory=HandMasks)
     """Drawing of hands and arms."""
     motion: TrackObjects = field(default_factory=TrackObjects)

@@ -16,6 +16,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from glob import escape, glob
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32
@@ -52,6 +53,7 @@ MAX_TEXT_BYTES = 2**20
 class RecordedConfig:
     """Perception results read from the files of one clip, or of one clip per step."""
 
+    reads_ground_truth: ClassVar[bool] = False
     folder: Path
     """Folder with pose/, intrinsics/, depth/ and mask/."""
     name: str

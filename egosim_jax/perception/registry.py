@@ -46,6 +46,14 @@ class PipelineConfig(Protocol):
         ...
 
 
+def reads_ground_truth(config: PipelineConfig) -> bool:
+    """Return False if a config states that its `build` ignores the ground truth.
+
+    Ground truth of a simulated world is slow to render.
+    """
+    return getattr(config, "reads_ground_truth", True)
+
+
 def register(name: str) -> Callable[[C], C]:
     """Return a decorator that registers a config class under a name; the last one wins."""
 

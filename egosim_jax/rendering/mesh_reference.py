@@ -8,6 +8,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 from egosim_jax.geometry import invert, pixel_rays, transform
 from egosim_jax.rendering.mesh import AMBIENT, DIFFUSE, MovingMesh, vertex_normals
 from egosim_jax.rendering.skeleton import NEAR_M
+from egosim_jax.runtime.open3d import load_open3d
 from egosim_jax.types import Cameras, InputError
 
 
@@ -40,7 +41,7 @@ def draw_scene(
     Returns the image and the mask: 255, and black, where no triangle is seen. Raises `InputError`
     if the first frame shows none.
     """
-    import open3d as o3d
+    o3d = load_open3d()
 
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(
@@ -76,7 +77,7 @@ def _draw(
     rays: Float[np.ndarray, "h w 3"],
 ) -> None:
     """Draw the given triangles of one frame, in camera coordinates."""
-    import open3d as o3d
+    o3d = load_open3d()
 
     triangles = mesh.triangles[given]
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)

@@ -12,6 +12,7 @@ from PIL import Image
 from egosim_jax.geometry import UP_AXES, Up, look_at
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.rendering.reference import render
+from egosim_jax.runtime.open3d import load_open3d
 from egosim_jax.types import Cameras, SceneState
 
 SIDES, ABOVE = (-40.0, 0.0, 40.0), 30.0
@@ -40,7 +41,7 @@ def portrait(state: SceneState, *, up: Up) -> UInt8[np.ndarray, "3 480 640 3"]:
     The front view looks the way a wearer does: along y if z is up, along z if -y is up. The point
     size is the distance between neighboring points, up to `MAX_POINT_PX`.
     """
-    import open3d as o3d
+    o3d = load_open3d()
 
     upward = np.array(UP_AXES[up])
     forward = np.array({"z": (0.0, 1.0, 0.0), "-y": (0.0, 0.0, 1.0)}[up])

@@ -25,6 +25,7 @@ from typing import (
 )
 
 from egosim_jax.runtime import interrupts
+from egosim_jax.runtime.phases import show_phases
 from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import InputError
 
@@ -104,7 +105,7 @@ def main(
         about = f"{description} --version prints the version."
         command = _parse(commands, given, program, about)
         _refuse_empty(command)
-        with context():
+        with context(), show_phases():
             code = command.run()
         if args is None:
             interrupts.ignore()  # the process ends: there is nothing to continue

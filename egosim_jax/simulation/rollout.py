@@ -21,6 +21,7 @@ from egosim_jax.io.journal import Journal
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.perception import archive
 from egosim_jax.rendering import POINT_PX, Renderer, reference
+from egosim_jax.runtime.phases import phase
 from egosim_jax.simulation.simulator import (
     ClipStream,
     FrameTimer,
@@ -32,7 +33,7 @@ from egosim_jax.simulation.simulator import (
 )
 from egosim_jax.state import snapshot
 from egosim_jax.state.fuse import fuse
-from egosim_jax.types import Action, Clip, SceneState, View, check_seed
+from egosim_jax.types import Action, Clip, Perceived, SceneState, View, check_seed
 
 OUTPUTS = ("clip_*/*",)
 """Globs of files that only a journaled simulation writes."""
@@ -102,13 +103,15 @@ class Rollout:
         simulator, folder = self.simulator, self.folder / f"clip_{number}"
         timer, by_chunk = FrameTimer(simulator.show), simulator.update_every == "chunk"
         timed, made = replace(simulator, show=timer), list[Step]()
-        view = simulator.render(state, action)  # not journaled: it follows from state and action
+        with phase(f"clip {number}: renders the view", only_if_long=True):
+            view = simulator.render(state, action)  # not journaled: it follows from its inputs
 
         def make() -> Clip:
-            if not by_chunk:
-                return timed.generate(view, action, seed=seed, first_frame=first_frame)
-            made.append(timed.step(state, action, seed=seed, first_frame=first_frame))
-            return made[0].clip
+            with phase(f"clip {number}: generates"):
+                if not by_chunk:
+                    return timed.generate(view, action, seed=seed, first_frame=first_frame)
+                made.append(timed.step(state, action, seed=seed, first_frame=first_frame))
+                return made[0].clip
 
         clip = journal.phase(
             f"{number} generate",
@@ -128,15 +131,24 @@ class Rollout:
             step = made[0] if made else replay.step(state, action, seed=seed)
             view, notes, make_state = step.view, step.notes, lambda: step.state
         else:
+
+            def perceive() -> Perceived:
+                with phase(f"clip {number}: perceives"):
+                    return perception(clip, action, state)
+
             perceived = journal.phase(
                 f"{number} perceive",
                 folder / "perceived.npz",
-                make=lambda: perception(clip, action, state),
+                make=perceive,
                 save=archive.save,
                 load=archive.load,
             )
             notes = perceived.notes
-            make_state = lambda: fuse(state, perceived, fusion=simulator.fusion)  # noqa: E731
+
+            def make_state() -> SceneState:
+                with phase(f"clip {number}: updates the state", only_if_long=True):
+                    return fuse(state, perceived, fusion=simulator.fusion)
+
         after = journal.phase(
             f"{number} fuse",
             folder / "state",

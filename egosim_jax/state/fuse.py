@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from egosim_jax.geometry import cameras_in_object_frame, invert, pixels_of, transform
+from egosim_jax.runtime.open3d import load_open3d
 from egosim_jax.state.filter import disappeared_objects
 from egosim_jax.state.new_objects import with_objects
 from egosim_jax.state.tsdf import Fusion, surface, valid_depth_mask
@@ -184,7 +185,7 @@ def _surface_behind(
 
 
 def _remove_outliers(new: _Points) -> _Points:
-    import open3d as o3d
+    o3d = load_open3d()
 
     if len(new.points_m) <= OUTLIER_NEIGHBORS:
         return new
@@ -197,7 +198,7 @@ def _has_neighbor(
     points_m: Float32[np.ndarray, "n 3"], others_m: Float32[np.ndarray, "m 3"], radius_m: float
 ) -> Bool[np.ndarray, " n"]:
     """Return which points have a neighbor among the others, within a radius in meters."""
-    import open3d as o3d
+    o3d = load_open3d()
 
     if not len(points_m) or not len(others_m):
         return np.zeros(len(points_m), bool)
@@ -207,7 +208,7 @@ def _has_neighbor(
 
 def transfer_colors(new: _Points, old: _Points) -> UInt8[np.ndarray, "n 3"]:
     """Return the colors of new points, from the nearest old point that they replace, if any."""
-    import open3d as o3d
+    o3d = load_open3d()
 
     colors = new.colors.copy()
     for number in np.intersect1d(new.object_ids, old.object_ids):

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
 from egosim_jax.geometry import pixel_rays
+from egosim_jax.runtime.open3d import load_open3d
 from egosim_jax.state.depth import known_depth
 from egosim_jax.state.planes import SupportPlane, area_of, fit_plane, support_planes
 from egosim_jax.state.regions import RegionConfig, find_regions
@@ -285,7 +286,7 @@ def _refine(
 
 def object_sizes(state: SceneState) -> dict[int, Float[np.ndarray, " 3"]]:
     """Return the extents of each object's points along its own axes in meters, ascending."""
-    import open3d as o3d
+    o3d = load_open3d()
 
     sizes = {}
     for number in np.unique(state.object_ids[state.object_ids > 0]).tolist():

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from egosim_jax.runtime.open3d import load_open3d
+
 ITERATIONS = 500
 """Number of RANSAC trials per plane."""
 MAX_FITS = 12
@@ -50,7 +52,7 @@ def fit_plane(
 
     It needs at least three points.
     """
-    import open3d as o3d
+    o3d = load_open3d()
     from threadpoolctl import threadpool_limits
 
     o3d.utility.random.seed(0)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, Shaped, UInt8
 
 from egosim_jax.geometry import pixel_rays, transform
+from egosim_jax.runtime.open3d import load_open3d
 from egosim_jax.types import Cameras, InputError
 
 DEPTH_WINDOW_PX = 5
@@ -75,7 +76,7 @@ def surface(
 
     Depths that are 0, infinite or NaN are unknown; frames without any known depth are skipped.
     """
-    import open3d as o3d
+    o3d = load_open3d()
 
     known = np.isfinite(depth_m) & (depth_m > 0) & (depth_m <= fusion.max_depth_m)
     frames = np.flatnonzero(known.any(axis=(1, 2)))
@@ -157,6 +158,6 @@ def _unique(cells: Int32[np.ndarray, "m 3"]) -> Int32[np.ndarray, "n 3"]:
 
 
 def _image(pixels: Shaped[np.ndarray, "h w *c"]) -> object:
-    import open3d as o3d
+    o3d = load_open3d()
 
     return o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(pixels)))

@@ -10,7 +10,7 @@ import pytest
 import tyro
 import yaml
 
-from egosim_jax.cli.__main__ import Commands
+from egosim_jax.cli.commands import Commands
 from egosim_jax.convert.__main__ import Commands as Conversions
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.train.__main__ import Commands as Recipes

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
+from egosim_jax.runtime.open3d import load_open3d
+
 ON_SURFACE_M = 0.01
 """Maximum distance in meters of a point on a surface."""
 SAME_POINT_M = 0.005
@@ -69,7 +71,7 @@ def distance_to_mesh(
     surface: tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"]],
 ) -> Float32[np.ndarray, " n"]:
     """Return the distance of each point from the nearest triangle, in meters."""
-    import open3d as o3d
+    o3d = load_open3d()
 
     scene = o3d.t.geometry.RaycastingScene()
     vertices, triangles = surface
@@ -83,7 +85,7 @@ def nearest(
     points_m: Float[np.ndarray, "n 3"], others_m: Float[np.ndarray, "m 3"]
 ) -> Float[np.ndarray, " n"]:
     """Return the distance of each point to the nearest of the others; infinite without others."""
-    import open3d as o3d
+    o3d = load_open3d()
 
     if not len(points_m) or not len(others_m):
         return np.full(len(points_m), np.inf)

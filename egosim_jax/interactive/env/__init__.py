@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
+from egosim_jax.runtime.phases import phase, show_phases
 from egosim_jax.simulation.start import Start
 from egosim_jax.types import InputError
 
@@ -47,20 +48,45 @@ def load_backend(
 ) -> Backend:
     """Return the true tabletop world, or a model's world that batches up to `batch` clips.
 
-    The model is compiled for all batch sizes now, over all devices. Without `compile` it is
-    compiled at the first step. `update_every` updates the state after each clip or, with a causal
-    student, after each chunk of a clip.
+    The model is compiled for all batch sizes now, over all devices. Stderr lists all that is loaded
+    and compiled. Without `compile` it is compiled at the first step. `update_every` updates the
+    state after each clip or, with a causal student, after each chunk of a clip.
     """
-    from dataclasses import replace
+    with show_phases():
+        return _load_backend(
+            world,
+            config=config,
+            weights=weights,
+            perception=perception,
+            steps=steps,
+            batch=batch,
+            compile=compile,
+            update_every=update_every,
+        )
 
-    from egosim_jax import configs
-    from egosim_jax.generation.generator import Generator
-    from egosim_jax.interactive.env.backends import GeneratedWorld
-    from egosim_jax.interactive.env.batching import Batcher
-    from egosim_jax.interactive.env.true_world import TrueWorld
-    from egosim_jax.sharding import make_mesh, parts
-    from egosim_jax.simulation.simulator import check_update_every
-    from egosim_jax.types import MeshConfig
+
+def _load_backend(
+    world: World,
+    *,
+    config: str,
+    weights: Path | str | None,
+    perception: str,
+    steps: int | None,
+    batch: int,
+    compile: bool,
+    update_every: Literal["clip", "chunk"],
+) -> Backend:
+    with phase(f"loads JAX and the {world} world of {config}"):
+        from dataclasses import replace
+
+        from egosim_jax import configs
+        from egosim_jax.generation.generator import Generator
+        from egosim_jax.interactive.env.backends import GeneratedWorld
+        from egosim_jax.interactive.env.batching import Batcher
+        from egosim_jax.interactive.env.true_world import TrueWorld
+        from egosim_jax.sharding import make_mesh, parts
+        from egosim_jax.simulation.simulator import check_update_every
+        from egosim_jax.types import MeshConfig
 
     model = configs.get(config)
     model = replace(model, steps=steps or model.steps)

@@ -32,6 +32,7 @@ from egosim_jax.interactive.env.parts import OpenStep, part_rows
 from egosim_jax.interactive.env.rewards import Outcome, RewardFn, check_reward, no_reward
 from egosim_jax.interactive.env.validity import validity
 from egosim_jax.io.bounded import quote
+from egosim_jax.runtime.phases import phase, show_phases
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.simulation.simulator import Step
 from egosim_jax.simulation.start import Start, check_size
@@ -286,7 +287,8 @@ class WorldEnv(gymnasium.Env):
         given = seed_of(seed)
         super().reset(seed=given)
         chosen = int(self.np_random.integers(2**31)) if given is None else given
-        start = start_from_options(self.backend, self.actions, seed=chosen, options=options)
+        with show_phases(), phase("makes the scene", only_if_long=True):
+            start = start_from_options(self.backend, self.actions, seed=chosen, options=options)
         check_reward(self._reward, start)
         self._running, self._ended = RunningEpisode(self.backend, self.actions, start), False
         self._open = None

@@ -25,6 +25,7 @@ from egosim_jax.interactive.env.single import (
     to_options,
 )
 from egosim_jax.io.bounded import quote
+from egosim_jax.runtime.phases import phase, show_phases
 from egosim_jax.types import InputError, check_counts
 
 Seeds = SupportsIndex | Sequence[SupportsIndex | None] | np.ndarray | None
@@ -117,18 +118,20 @@ class WorldVectorEnv(VectorEnv):
             )
         chosen = np.flatnonzero(mask).tolist()
         # all starts are made before any episode changes: one bad option begins none
-        begun = [
-            start_from_options(
-                self.backend, self.actions, seed=seeds[number], options=starts[number]
-            )
-            for number in chosen
-        ]
+        with show_phases(), phase(f"makes {len(chosen)} scenes", only_if_long=True):
+            begun = [
+                start_from_options(
+                    self.backend, self.actions, seed=seeds[number], options=starts[number]
+                )
+                for number in chosen
+            ]
         for number, start in zip(chosen, begun, strict=True):
             check_reward(self._rewards[number], start)
         for number, start in zip(chosen, begun, strict=True):
             self._running[number] = RunningEpisode(self.backend, self.actions, start)
         self._ended[mask] = False
-        return self._observations(), self._infos([running.info() for running in self.running])
+        with show_phases(), phase("draws the first observations", only_if_long=True):
+            return self._observations(), self._infos([running.info() for running in self.running])
 
     def _seeds(self, seed: Seeds) -> list[int]:
         """Return the seed of each episode; missing seeds are drawn from `np_random`."""

@@ -55,8 +55,23 @@ Attend = Callable[[jax.Array, jax.Array, jax.Array], tuple[Float[Array, "b n h k
 
 xavier = nnx.initializers.xavier_uniform()
 normal = nnx.initializers.normal(0.02)
-gelu_tanh = partial(jax.nn.gelu, approximate=True)
-gelu_erf = partial(jax.nn.gelu, approximate=False)
+
+
+# Functions of this module, unlike `jax.nn.silu` or a partial function, are pickled by their names
+# (`executables.cached_trace`), so that a network from the cache equals a traced one.
+def silu(x: Array) -> Array:
+    """Return x · sigmoid(x)."""
+    return jax.nn.silu(x)
+
+
+def gelu_tanh(x: Array) -> Array:
+    """Return the approximation of GELU by tanh."""
+    return jax.nn.gelu(x, approximate=True)
+
+
+def gelu_erf(x: Array) -> Array:
+    """Return the exact GELU."""
+    return jax.nn.gelu(x, approximate=False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,7 +192,7 @@ class TimeEmbedding(nnx.Module):
     def __init__(self, config: WanDiTSizes, *, rngs: nnx.Rngs):
         sizes = (config.freq_dim, config.dim, config.dim)
         self.freq_dim = config.freq_dim
-        self.mlp = MLP(config, sizes, jax.nn.silu, init=normal, rngs=rngs)
+        self.mlp = MLP(config, sizes, silu, init=normal, rngs=rngs)
         self.modulation = linear(config, (config.dim, 6 * config.dim), ("embed", None), rngs)
 
     def __call__(

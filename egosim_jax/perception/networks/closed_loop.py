@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from jaxtyping import Bool, Int32
@@ -170,6 +170,7 @@ def keep_changes(clip: Clip, action: Action, state: SceneState, so_far: Observat
 class NetworksConfig:
     """Perception by networks for depth, segmentation and tracking, from local checkpoints."""
 
+    reads_ground_truth: ClassVar[bool] = False
     depth: Literal["depth-anything", "depth-pro", "depth-anything-3"] = "depth-anything"
     """Depth network of the pipeline."""
     depth_folder: Path

@@ -5,7 +5,8 @@ are ray cast, and joints, poses, depth and ids come from the same geometry.
 
 Sequences of a seed (`sequence`)
     make_sequence: rendered clips with ground truth; make_scripts: the same clips, not rendered;
-    Script: one of them; start_of_sequence: first scene, camera, frame and state
+    Script: one of them; start_of_sequence: first scene, camera, frame and state;
+    episode_of_sequence: the actions, without ground truth
 Any action (`world`)
     World: executes actions
 Scenes (`scene`, `scene_spec`)
@@ -26,12 +27,14 @@ from egosim_jax.worlds.tabletop.clips import (
     to_action,
     to_episode,
     to_ground_truth,
+    to_known,
     to_triplet,
 )
 from egosim_jax.worlds.tabletop.scene import Scene, sample_scene
 from egosim_jax.worlds.tabletop.scene_spec import Object, make_scene, read_scene, write_scene
 from egosim_jax.worlds.tabletop.sequence import (
     Script,
+    episode_of_sequence,
     make_scripts,
     make_sequence,
     start_of_sequence,
@@ -44,6 +47,7 @@ __all__ = [
     "Script",
     "TabletopClip",
     "World",
+    "episode_of_sequence",
     "make_scene",
     "make_scripts",
     "make_sequence",
@@ -54,6 +58,7 @@ __all__ = [
     "to_action",
     "to_episode",
     "to_ground_truth",
+    "to_known",
     "to_triplet",
     "write_scene",
 ]

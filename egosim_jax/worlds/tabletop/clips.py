@@ -280,29 +280,38 @@ def to_action(clip: TabletopClip) -> Action:
 
     An action has no hand that its cameras do not see; `World.execute` takes such joints separately.
     """
-    seen = np.asarray(near_view(clip.cameras, clip.joints_m).any(axis=0))[:, None, None]
-    joints = clip.joints_m if seen.all() else np.where(seen, clip.joints_m, np.nan)
+    joints = seen_hands(clip.cameras, clip.joints_m)
     return Action(cameras=clip.cameras, joints_m=joints, kind=clip.kind, prompt=clip.caption)
+
+
+def seen_hands(
+    cameras: Cameras, joints_m: Float[np.ndarray, "f n j 3"]
+) -> Float[np.ndarray, "f n j 3"]:
+    """Return the joints with NaN for hands that are never in view."""
+    seen = np.asarray(near_view(cameras, joints_m).any(axis=0))[:, None, None]
+    return joints_m if seen.all() else np.where(seen, joints_m, np.nan)
 
 
 def to_episode(clips: Sequence[TabletopClip], *, fps: int) -> Episode:
     """Return a sequence as an episode with ground truth."""
-    truths = [to_ground_truth(clip) for clip in clips]
     return Episode(
         state=clips[0].state,
         actions=tuple(to_action(clip) for clip in clips),
         fps=fps,
         first_frame=clips[0].first.colors,
-        ground_truth=tuple(
-            GroundTruth(
-                frames=clip.frames,
-                depth_m=truth.depth_m,
-                object_ids=truth.object_ids,
-                motions=truth.motions,
-                target_id=clip.body_ids.get(clip.target),
-            )
-            for clip, truth in zip(clips, truths, strict=True)
-        ),
+        ground_truth=tuple(to_known(clip) for clip in clips),
+    )
+
+
+def to_known(clip: TabletopClip) -> GroundTruth:
+    """Return the ground truth of a clip, in the form of an episode."""
+    truth = to_ground_truth(clip)
+    return GroundTruth(
+        frames=clip.frames,
+        depth_m=truth.depth_m,
+        object_ids=truth.object_ids,
+        motions=truth.motions,
+        target_id=clip.body_ids.get(clip.target),
     )
 
 

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
+from egosim_jax.runtime.open3d import load_open3d
 from egosim_jax.types import InputError
 from egosim_jax.worlds.tabletop.primitives import Mesh
 
@@ -56,9 +58,9 @@ def rays_among(meshes: Sequence[Mesh]) -> Rays:
 
     Clips are made in parallel processes. Raises `InputError` if neither package is installed.
     """
-    for package, caster in (("open3d", _Open3D), ("embreex", _Embreex)):
+    for load, caster in ((load_open3d, _Open3D), (partial(import_module, "embreex"), _Embreex)):
         try:
-            import_module(package)
+            load()
         except ImportError:
             continue
         return caster(meshes)
@@ -70,7 +72,7 @@ def rays_among(meshes: Sequence[Mesh]) -> Rays:
 
 class _Open3D:
     def __init__(self, meshes: Sequence[Mesh]):
-        import open3d as o3d
+        o3d = load_open3d()
 
         self.tensor = o3d.core.Tensor
         self.scene = o3d.t.geometry.RaycastingScene(nthreads=1)

@@ -10,11 +10,19 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from egosim_jax.geometry import look_at
+from egosim_jax.simulation.episode import Episode
 from egosim_jax.types import Action, Cameras, Kind, SceneState, VideoSpec
 from egosim_jax.worlds.tabletop import hand_motion
-from egosim_jax.worlds.tabletop.clips import TabletopClip, first_view, provenance, render_clip
+from egosim_jax.worlds.tabletop.clips import (
+    TabletopClip,
+    first_view,
+    provenance,
+    render_clip,
+    seen_hands,
+)
 from egosim_jax.worlds.tabletop.hand_motion import Hand, Intent, Moment
 from egosim_jax.worlds.tabletop.raycast import Frame
 from egosim_jax.worlds.tabletop.scene import Scene, sample_scene, with_cloths
@@ -44,14 +52,20 @@ class Script:
         return self.moments[0].scene
 
     @property
+    def joints_m(self) -> Float[np.ndarray, "f n j 3"]:
+        """World positions of the joints of all hands in meters."""
+        return np.array(
+            [
+                [hand.grip.pose(self.kind, hand.side)[0] for hand in moment.hands]
+                for moment in self.moments
+            ]
+        )
+
+    @property
     def action(self) -> Action:
         """Cameras, joints and prompt, for `World.execute`."""
-        joints = [
-            [hand.grip.pose(self.kind, hand.side)[0] for hand in moment.hands]
-            for moment in self.moments
-        ]
         return Action(
-            cameras=self.cameras, joints_m=np.array(joints), kind=self.kind, prompt=self.caption
+            cameras=self.cameras, joints_m=self.joints_m, kind=self.kind, prompt=self.caption
         )
 
 
@@ -133,6 +147,31 @@ def make_scripts(
             caption=f"{who} {intent.caption}",
         )
         scene, hands = moments[-1].scene, moments[-1].hands
+
+
+def episode_of_sequence(
+    seed: int, *, spec: VideoSpec, clips: int = 1, kind: Kind = "human"
+) -> Episode:
+    """Return the episode of a sequence without ground truth, which is slow to render.
+
+    `clips.to_episode` returns it with ground truth.
+    """
+    scripts = list(make_scripts(seed, spec=spec, clips=clips, kind=kind))
+    first, state = first_view(scripts[0].scene, scripts[0].cameras)
+    return Episode(
+        state=replace(state, provenance=provenance(seed)),
+        actions=tuple(
+            Action(
+                cameras=script.cameras,
+                joints_m=seen_hands(script.cameras, script.joints_m),
+                kind=kind,
+                prompt=script.caption,
+            )
+            for script in scripts
+        ),
+        fps=spec.fps,
+        first_frame=first.colors,
+    )
 
 
 def start_of_sequence(

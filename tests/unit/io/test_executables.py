@@ -14,13 +14,15 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import pytest
+from flax import nnx
 from jax.experimental.compilation_cache import compilation_cache
 
 from egosim_jax import configs
 from egosim_jax.configs.model import Networks
 from egosim_jax.generation.generator import Generator
 from egosim_jax.io import executables, private
-from egosim_jax.io.executables import cached_compile
+from egosim_jax.io.executables import cached_compile, cached_trace
+from egosim_jax.models import abstract
 from tests.flags import devices
 
 GIVEN = (jax.ShapeDtypeStruct((3,), jnp.float32),)
@@ -357,7 +359,8 @@ def test_what_jaxs_own_cache_has_is_stored_completely(folder, tmp_path):
 
 ONE_OF_TWO = """
 import jax
-from egosim_jax.io.executables import cached_compile
+from egosim_jax.io.executables import cached_compile, cached_trace
+from egosim_jax.models import abstract
 from tests.flags import devices
 
 given = (jax.ShapeDtypeStruct((3,), "float32"),)
@@ -373,3 +376,61 @@ def test_a_function_of_one_device_is_loaded_for_one_of_several(tmp_path):
         [sys.executable, "-c", ONE_OF_TWO], env=environment, capture_output=True, text=True
     )
     assert done.stdout == "[0. 2. 4.]\n" * 2, done.stderr
+
+
+def activate(x):
+    return x
+
+
+@pytest.fixture
+def network():
+    """A traced object, and the number of its traces."""
+
+    def trace():
+        trace.times += 1
+        return {"kernel": WIDE, "activation": trace.activation}
+
+    trace.times, trace.activation = 0, activate
+    return trace
+
+
+def test_a_network_is_traced_once(folder, network):
+    first, second = (cached_trace("network", network) for _ in range(2))
+    assert network.times == 1
+    assert first == second
+    assert second["activation"] is activate
+    cached_trace("another network", network)
+    assert network.times == 2
+    assert len(list(folder.iterdir())) == 2
+
+
+def test_a_network_of_the_cache_equals_a_traced_one(folder):
+    config = configs.get("tabletop")
+    first, second = (Networks.abstract(config) for _ in range(2))
+    assert nnx.graphdef(first) == nnx.graphdef(second)
+    for name, network in config.networks.items():
+        assert nnx.graphdef(getattr(second, name)) == nnx.graphdef(abstract(network))
+
+
+def test_a_network_with_a_function_without_a_name_is_traced_again(folder, network):
+    network.activation = lambda x: x
+    for times in (1, 2):
+        cached_trace("network", network)
+        assert network.times == times
+    assert not list(folder.iterdir())
+
+
+def test_a_network_of_other_code_is_traced_again(folder, network, monkeypatch):
+    cached_trace("network", network)
+    monkeypatch.setattr(executables, "_code", lambda: "of tomorrow")
+    cached_trace("network", network)
+    assert network.times == 2
+
+
+def test_a_damaged_network_is_traced_again(folder, network):
+    cached_trace("network", network)
+    (path,) = folder.iterdir()
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.warns(UserWarning, match="damaged"):
+        cached_trace("network", network)
+    assert network.times == 2

@@ -15,9 +15,9 @@ import pytest
 from packaging.requirements import Requirement
 
 import egosim_jax
-from egosim_jax.cli.__main__ import Commands
 from egosim_jax.cli.__main__ import main as egosim
 from egosim_jax.cli.annotate import Annotate
+from egosim_jax.cli.commands import Commands
 from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.generate import Generate
 from egosim_jax.cli.serve import Serve

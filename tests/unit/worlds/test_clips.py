@@ -1,13 +1,21 @@
 """Static priors of tabletop clips show the scene of the first frame, and the hands' meshes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from egosim_jax import configs
 from egosim_jax.data.shards import ShardReader
+from egosim_jax.io.digest import fingerprint
 from egosim_jax.rendering.reference import render, splat
 from egosim_jax.types import InputError, VideoSpec
-from egosim_jax.worlds.tabletop import make_sequence, to_triplet
+from egosim_jax.worlds.tabletop import (
+    episode_of_sequence,
+    make_sequence,
+    to_episode,
+    to_triplet,
+)
 from egosim_jax.worlds.tabletop.clips import POINT_PX, hand_video, static_video
 from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND
@@ -98,3 +106,12 @@ def test_meshes_of_grippers_are_refused():
     clip = next(make_sequence(3, spec=VideoSpec(frames=1, height=32, width=48), kind="robot"))
     with pytest.raises(InputError, match="have no mesh"):
         hand_video(clip)
+
+
+@pytest.mark.parametrize("kind", ["human", "robot"])
+def test_an_episode_without_ground_truth_is_that_of_the_rendered_clips(kind):
+    clips = list(make_sequence(1, spec=SPEC, clips=2, kind=kind))
+    rendered = to_episode(clips, fps=SPEC.fps)
+    quick = episode_of_sequence(1, spec=SPEC, clips=2, kind=kind)
+    assert quick.ground_truth == ()
+    assert fingerprint(quick) == fingerprint(replace(rendered, ground_truth=()))

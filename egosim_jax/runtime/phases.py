@@ -1,0 +1,100 @@
+"""Phases of a command: what it loads, compiles and makes, on stderr while it happens.
+
+Library code opens a `phase` around slow work. It prints only inside `show_phases`, which commands
+and environments enter. A phase prints a line when it begins. If it lasts, a terminal shows a live
+line with the time, and a log gets a line every `PLAIN_SECONDS`.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from egosim_jax.runtime.progress import PLAIN_SECONDS
+from egosim_jax.runtime.terminal import printable
+
+LIVE_SECONDS = 5.0
+"""Age in seconds from which a phase has a live line on a terminal."""
+
+
+class _Shown:
+    """Number of open `show_phases`, and the open phases, of all threads."""
+
+    depth = 0
+    phases: list[object] = []  # noqa: RUF012 - one for the process
+    lock = threading.Lock()
+
+
+@contextmanager
+def show_phases() -> Iterator[None]:
+    """Show the phases of this process inside the context. For commands and environments."""
+    with _Shown.lock:
+        _Shown.depth += 1
+    try:
+        yield
+    finally:
+        with _Shown.lock:
+            _Shown.depth -= 1
+
+
+@contextmanager
+def phase(text: str, *, only_if_long: bool = False) -> Iterator[None]:
+    """Show a phase, if phases are shown, while the context is open.
+
+    With `only_if_long` its first line waits until a live line or a repeated line is due.
+    """
+    if not _Shown.depth:
+        yield
+        return
+    text = printable(text)
+    if not only_if_long:
+        print(text, file=sys.stderr, flush=True)
+    ended = threading.Event()
+    watch = _watch_terminal if sys.stderr.isatty() else _watch_log
+    thread = threading.Thread(target=watch, args=(text, ended), name="phase", daemon=True)
+    with _Shown.lock:
+        _Shown.phases.append(ended)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        with _Shown.lock:
+            _Shown.phases.remove(ended)
+
+
+def _is_innermost(ended: threading.Event) -> bool:
+    with _Shown.lock:
+        return bool(_Shown.phases) and _Shown.phases[-1] is ended
+
+
+def _watch_log(text: str, ended: threading.Event) -> None:
+    since = time.monotonic()
+    while not ended.wait(PLAIN_SECONDS):
+        if _is_innermost(ended):
+            print(f"{text}: {time.monotonic() - since:.0f} s", file=sys.stderr, flush=True)
+
+
+def _watch_terminal(text: str, ended: threading.Event) -> None:
+    since = time.monotonic()
+    while not ended.wait(LIVE_SECONDS):
+        if _is_innermost(ended):
+            break
+    else:
+        return
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn
+
+    # Not rich's own clock: the phase began before its live line.
+    columns = SpinnerColumn(), TextColumn("{task.description}", markup=False)
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, redirect_stdout=False) as live:
+        task = live.add_task(text)
+        while True:
+            live.update(task, description=f"{text}: {time.monotonic() - since:.0f} s")
+            if ended.wait(0.5):
+                return
