@@ -75,7 +75,7 @@ def test_the_client_needs_no_package_of_ours(port, capsys):
     (script,) = re.findall(r"```python\n(.*?)```", TEXT, re.S)
     assert len(script.splitlines()) <= 25
     imported = set(re.findall(r"^(?:import|from) (\w+)", script, re.M))
-    assert imported == {"json", "msgpack", "websockets"}
+    assert imported == {"msgpack", "websockets"}
     exec(compile(script.replace("8000", str(port)), "protocol.md", "exec"), {})  # noqa: S102
     shape = (VIDEO.frames, VIDEO.height, VIDEO.width, 3)
     assert capsys.readouterr().out == f"painted\n{shape}\n"
