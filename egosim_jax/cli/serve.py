@@ -23,7 +23,7 @@ NEEDS = ("fastapi", "uvicorn", "websockets", "msgpack", "prometheus_client")
 class Serve:
     """Serve sessions of a world over websocket and HTTP, for policies to step.
 
-    openpi-client can connect to it; docs/serving.md describes the requests. Sessions are kept in
+    openpi-client can connect to it; docs/protocol.md describes the messages. Sessions are kept in
     OUT: after a crash, the same command resumes all of them. SIGTERM finishes the running steps
     first. Needs the extra `serve`. Prints the address when the server is ready.
     """

@@ -1,9 +1,14 @@
-"""Every command that the documents show is one that the programs understand."""
+"""Every command that the documents show is one that the programs understand.
+
+Their Python is run by `tests/system/test_documents.py` and the tests in `FENCED`.
+"""
 
 import math
 import re
 import shlex
 import subprocess
+import tomllib
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -32,6 +37,16 @@ COMMAND = re.compile(
     re.M,
 )
 """In an indented line, behind what starts it and before what sends it to the background."""
+MODULE = re.compile(r"^    (?:.*&& )?python -m ([\w.]+)", re.M)
+SCRIPT = re.compile(r"^    python (examples/\S+)", re.M)
+FENCE = re.compile(r"^```python\n(.*?)^```", re.M | re.S)
+FENCED = {
+    "environments.md": "tests/unit/interactive/env/test_documented_script.py",
+    "protocol.md": "tests/unit/interactive/server/test_documented_protocol.py",
+    "serving.md": None,  # openpi-client needs numpy 1
+    "streaming.md": None,  # names stand for your own model and policy
+}
+"""Test that runs the fenced Python of each page; None if it is only compiled."""
 LAUNCH = re.compile(r"^    python -m egosim_jax.train.launch (.*? -- .*)$", re.M)
 DRY_RUN = re.compile(r"^#   (egosim train .* --preflight .*)$", re.M)
 SLURM = ROOT / "examples" / "slurm" / "egosim_14b.sbatch"
@@ -72,6 +87,41 @@ EXAMPLES = {
     *map(dry_run, PODS),
 }
 COMMANDS = sorted({command for path in PATHS for command in shown(path)} | EXAMPLES)
+
+
+def pages(nav: list | str) -> list[str]:
+    """The pages of the navigation."""
+    if isinstance(nav, str):
+        return [nav]
+    return [page for entry in nav for part in entry.values() for page in pages(part)]
+
+
+def test_the_navigation_has_every_page_once():
+    nav = tomllib.loads((ROOT / "zensical.toml").read_text("utf-8"))["project"]["nav"]
+    assert sorted(pages(nav)) == sorted(path.name for path in (ROOT / "docs").glob("*.md"))
+    assert [name for entry in nav[1:] for name in entry] == [
+        "Tutorial",
+        "How-to guides",
+        "Reference",
+        "Explanation",
+    ]
+
+
+@pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
+def test_modules_and_scripts_of_a_page_exist(path):
+    text = path.read_text("utf-8")
+    assert all((ROOT / script).exists() for script in SCRIPT.findall(text))
+    for module in MODULE.findall(text):
+        assert module == "venv" or find_spec(module)
+
+
+def test_fenced_python_has_a_test():
+    found = {path.name for path in PATHS if FENCE.search(path.read_text("utf-8"))}
+    assert found == FENCED.keys()
+    for name, test in FENCED.items():
+        for code in FENCE.findall((ROOT / "docs" / name).read_text("utf-8")):
+            compile(code, name, "exec")
+        assert test is None or name in (ROOT / test).read_text("utf-8")
 
 
 def test_there_are_commands_of_every_program():

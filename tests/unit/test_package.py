@@ -1,6 +1,7 @@
 """The package itself: what importing it costs, and what it never imports."""
 
 import ast
+import re
 import subprocess
 import sys
 import tomllib
@@ -29,6 +30,14 @@ def modules_after(statement: str) -> set[str]:
 
 def test_importing_the_package_imports_nothing_heavy():
     assert not modules_after("import egosim_jax") & {"jax", "flax", "numpy", "av", "grain"}
+
+
+def test_package_citation_and_changelog_have_one_version():
+    project = tomllib.loads((CLONE / "pyproject.toml").read_text("utf-8"))["project"]
+    (cited,) = re.findall(r"^version: (.*)$", (CLONE / "CITATION.cff").read_text("utf-8"), re.M)
+    released = re.findall(r"^## (\S+)", (CLONE / "CHANGELOG.md").read_text("utf-8"), re.M)
+    newest = next(version for version in released if version != "Unreleased")
+    assert project["version"] == cited == newest
 
 
 def test_types_know_no_jax():

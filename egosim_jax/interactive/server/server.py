@@ -37,7 +37,7 @@ DRAIN_TIMEOUT_S = 300.0
 """Maximum time that a shutdown waits for running requests."""
 BODY = {
     "requestBody": {
-        "description": "Fields of the request; see docs/serving.md.",
+        "description": "Fields of the request; see docs/protocol.md.",
         "content": {"application/json": {"schema": {"type": "object"}}},
         "required": True,
     }

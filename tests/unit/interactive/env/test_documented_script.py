@@ -1,4 +1,4 @@
-"""Script of docs/serving.md, in the true world with small frames."""
+"""Scripts of docs/environments.md, in the true world with small frames."""
 
 import re
 from pathlib import Path
@@ -11,16 +11,30 @@ from egosim_jax.types import VideoSpec
 
 ROOT = Path(__file__).parents[4]
 VIDEO = VideoSpec(frames=17, height=8, width=16, fps=8)
+TEXT = (ROOT / "docs" / "environments.md").read_text("utf-8")
+LIFT, BATCH = re.findall(r"```python\n(.*?)```", TEXT, re.S)
 
 
-@pytest.mark.slow
-def test_the_documented_script_separates_good_policies_from_bad_ones(monkeypatch, capsys):
-    text = (ROOT / "docs" / "serving.md").read_text("utf-8")
-    script = re.findall(r"```python\n(.*?)```", text, re.S)[0]
-    assert len(script.splitlines()) == 25
+@pytest.fixture(autouse=True)
+def small_frames(monkeypatch):
     monkeypatch.setattr(
         egosim_jax.interactive.env, "load_backend", lambda world, **options: TrueWorld(video=VIDEO)
     )
+
+
+def run(script):
+    exec(compile(script, "environments.md", "exec"), {})  # noqa: S102
+
+
+def test_the_documented_policy_lifts_the_object_whose_pose_it_reads(capsys):
+    run(LIFT)
+    assert capsys.readouterr().out == "red box rises by 0.1 m\n"
+
+
+@pytest.mark.slow
+def test_the_documented_script_separates_good_policies_from_bad_ones(capsys):
+    script = BATCH
+    assert len(script.splitlines()) == 25
     for shown, small in (
         ('("generated", "true")', '("true",)'),
         ("[:8]", "[:2]"),
@@ -28,7 +42,7 @@ def test_the_documented_script_separates_good_policies_from_bad_ones(monkeypatch
     ):
         assert shown in script
         script = script.replace(shown, small)
-    exec(compile(script, "serving.md", "exec"), {})  # noqa: S102
+    run(script)
     exact, never = capsys.readouterr().out.splitlines()
     assert exact == "true exact success 1.00"
     assert never == "true never closes success 0.00"
