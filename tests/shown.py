@@ -92,5 +92,6 @@ def windows_of_hands(folder, grays, **changes):
 def uncached(monkeypatch):
     """Compile without the cache, which knows networks by their configs alone."""
     monkeypatch.setattr(
-        "egosim_jax.generation.compiled.cached_compile", lambda key, args, compile: compile()
+        "egosim_jax.generation.compiled.cached_compile",
+        lambda key, args, compile, about: compile(),
     )
