@@ -91,7 +91,7 @@ def cached_trace(key: Any, trace_fn: Callable[[], Any]) -> Any:
     sources = _sources(key)
     if sources is None or (cache := PrivateCache.open(FOLDER, most=MAX_FILES)) is None:
         return trace_fn()
-    name = _hash({"key": repr((key, sources)), **_libraries()})
+    name = _hash({"key": repr((key, sources)), **_tracing()})
     if (data := cache.get(name)) is not None:
         try:
             return pickle.loads(data)  # noqa: S301
@@ -151,17 +151,20 @@ def _digest(key: Any, args: Any) -> str:
         ],
         "devices": [devices[0].device_kind, len(devices), devices[0].client.platform_version],
         "precision": jax.config.values["jax_default_matmul_precision"],
-        "wide": jax.config.values["jax_enable_x64"],
         "variables": [os.environ.get(name) for name in VARIABLES],
         "processor": _processor(),
-        **_libraries(),
+        **_tracing(),
     }
     return _hash(parts)
 
 
-def _libraries() -> dict[str, Any]:
-    """Return the versions of the libraries and the digest of the code."""
-    return {"versions": [metadata.version(name) for name in LIBRARIES], "code": _code()}
+def _tracing() -> dict[str, Any]:
+    """Return what any trace depends on."""
+    return {
+        "wide": jax.config.values["jax_enable_x64"],
+        "versions": [metadata.version(name) for name in LIBRARIES],
+        "code": _code(),
+    }
 
 
 def _hash(parts: Mapping[str, Any]) -> str:
