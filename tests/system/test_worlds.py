@@ -62,7 +62,7 @@ def test_a_student_is_compared_with_its_teacher_and_the_loop_resumes(tmp_path, c
     assert main(command) == 0
     report = json.loads((out / "report.json").read_text("utf-8"))
     rows = ["teacher, 2 steps", "teacher's weights, chunk by chunk"]
-    rows += [f"{rows[1]}, refreshed", "own", "own, refreshed", "student"]
+    rows += [f"{rows[1]}, refreshed", "own", "own, refreshed", "student, steps: 1", "student"]
     assert list(report["table"]) == rows
     assert report["table"]["own"] == report["table"]["student"]
     assert report["table"]["own"] != report["table"]["own, refreshed"]
