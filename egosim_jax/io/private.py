@@ -120,9 +120,13 @@ def _forget(folder: Path, most: int) -> None:
 
     Where reading a file does not change its time, those that were written longest ago.
     """
+    found = {}
     with os.scandir(folder) as entries:
-        files = [entry for entry in entries if not entry.is_dir(follow_symlinks=False)]
-        found = {entry.name: entry.stat(follow_symlinks=False) for entry in files}
+        for entry in entries:
+            # Another process may rename or remove a file at any time.
+            with suppress(FileNotFoundError):
+                if not entry.is_dir(follow_symlinks=False):
+                    found[entry.name] = entry.stat(follow_symlinks=False)
     used = {name: max(times.st_atime, times.st_mtime) for name, times in found.items()}
     names = [name for name in sorted(used, key=used.__getitem__) if TEMPORARY not in name]
     for name in names[:-most]:
