@@ -112,6 +112,12 @@ def contents(folder: Path) -> dict[str, bytes]:
     }
 
 
+def continues(path: str, data: bytes, kept: dict[str, bytes]) -> bool:
+    """Return True if a file is kept as it was; a journal may have more lines."""
+    found = kept.get(path, b"")
+    return found.startswith(data) if path.endswith("journal.jsonl") else found == data
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_on_a_full_disk_a_command_says_so_and_goes_on_when_there_is_room(name, made, disk, capfd):
     folder = disk("size=64k")
@@ -123,7 +129,7 @@ def test_on_a_full_disk_a_command_says_so_and_goes_on_when_there_is_room(name, m
     if name not in LONG:
         assert run(name, made, folder / "out") == 0, capfd.readouterr().err
         kept = contents(folder)
-        changed = {path for path, data in before.items() if kept.get(path) != data}
+        changed = {path for path, data in before.items() if not continues(path, data, kept)}
         assert not {path for path in changed if not path.endswith(PASSING) and PARTS not in path}
         assert not [path for path in kept if ".tmp" in path or ".part" in path]
 
