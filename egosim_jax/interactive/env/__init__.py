@@ -35,6 +35,7 @@ ID = "egosim_jax/Tabletop-v0"
 World = Literal["generated", "true"]
 
 
+@show_phases()
 def load_backend(
     world: World = "generated",
     *,
@@ -52,30 +53,6 @@ def load_backend(
     and compiled. Without `compile` it is compiled at the first step. `update_every` updates the
     state after each clip or, with a causal student, after each chunk of a clip.
     """
-    with show_phases():
-        return _load_backend(
-            world,
-            config=config,
-            weights=weights,
-            perception=perception,
-            steps=steps,
-            batch=batch,
-            compile=compile,
-            update_every=update_every,
-        )
-
-
-def _load_backend(
-    world: World,
-    *,
-    config: str,
-    weights: Path | str | None,
-    perception: str,
-    steps: int | None,
-    batch: int,
-    compile: bool,
-    update_every: Literal["clip", "chunk"],
-) -> Backend:
     with phase(f"loads JAX and the {world} world of {config}"):
         from dataclasses import replace
 
