@@ -31,6 +31,7 @@ def save(path: Path, perceived: Perceived) -> None:
         "size": [perceived.cameras.height, perceived.cameras.width],
         "tracked": tracked,
         "new": {str(number): len(found) for number, found in sorted(new.items())},
+        "held": {str(hand): number for hand, number in sorted(perceived.held.items())},
         "notes": list(perceived.notes),
     }
     arrays: dict[str, Any] = {
@@ -70,6 +71,7 @@ def load(path: Path) -> Perceived:
             world_from_object=dict(zip(about["tracked"], arrays.pop("paths"), strict=True)),
             interacted_frames=dict(zip(*interacted, strict=True)),
             new_objects={int(n): piece for n, piece in zip(counts, pieces, strict=True)},
+            held={int(hand): int(number) for hand, number in about.get("held", {}).items()},
             notes=tuple(str(note) for note in about["notes"]),
             **{name: arrays[name] for name in PIXELS},
         )

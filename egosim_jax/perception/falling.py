@@ -1,7 +1,7 @@
 """Motion of a released object: it falls to the surface below it, or is put down on it.
 
-A perceived height is off by millimeters. So the object's first height above its support is restored
-where it is put down (`snap`).
+A perceived height is off by millimeters. So the height above its support that the object had before
+it was taken is restored where it is put down (`snap`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SNAP_M = 0.02
 
 
 def fall(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"], fps: int) -> ObjectMotion:
-    """Return the motion with a fall, after the release, to its first height above the ground.
+    """Return the motion with a fall, after the release, to its height at rest above the ground.
 
     `others_m` are the other points of the state. An object does not fall if it was not lifted, if
     it is on a hinge, or if a hand holds it to the end.
@@ -45,7 +45,7 @@ def fall(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"], fps: int) -
 
 
 def snap(motion: ObjectMotion, others_m: Float32[np.ndarray, "n 3"]) -> ObjectMotion:
-    """Return the motion with a released object at its first height above the surface below it.
+    """Return the motion with a released object at its height at rest above the surface below it.
 
     An object that was never lifted may also keep its height: a drawer hangs in its case, and what
     is below it is not what it rests on. The smaller correction is made. It grows from the grasp to
@@ -70,7 +70,7 @@ def _gap_below(
 ) -> tuple[Float[np.ndarray, " 3"], float]:
     """Return the direction up, and how much higher above its support the object ends, in meters."""
     normal, offset = motion.model.plane[:3], motion.model.plane[3]
-    first, end = motion.model.points_m, transform(motion.path[-1], motion.model.points_m)
+    first, end = motion.model.rested_m, transform(motion.path[-1], motion.model.points_m)
     side = 1.0 if first.mean(axis=0) @ normal + offset > 0 else -1.0
     up, floor = side * normal, float(-side * offset)
     # Not the clearance alone: only the visible side has points, so it is not 0 on the ground.
@@ -80,9 +80,10 @@ def _gap_below(
 
 
 def _rises(motion: ObjectMotion, up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " f"]:
-    """Return how much higher than at first an object's center is in each frame, in meters."""
+    """Return how much higher than at rest an object's center is in each frame, in meters."""
     center = motion.model.points_m.mean(axis=0, keepdims=True)
-    return (transform(motion.path, center) - center)[:, 0] @ up
+    rested = motion.model.rested_m.mean(axis=0)
+    return (transform(motion.path, center) - rested)[:, 0] @ up
 
 
 def _clearance(

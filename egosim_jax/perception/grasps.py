@@ -62,6 +62,8 @@ class Grip:
     """Maximum distance of a gripped point from the line between the fingertips, in meters."""
     eyes_m: Float[np.ndarray, "f 3"]
     """Place of the camera in each frame."""
+    carried: int | None = None
+    """Object that the hand has held since the clip before, if it has one."""
 
     @classmethod
     def of(
@@ -72,19 +74,33 @@ class Grip:
         *,
         tolerance_m: float,
         radius_m: float,
+        before: tuple[int, Float[np.ndarray, "n 3"]] | None = None,
     ) -> Grip:
         """Return the grip of a hand whose opening changes by at most a tolerance in a hold.
 
         Missing frames are completed (`complete_hand`), and a hold is within the frames in between.
+        `before` is the object that the hand held at the end of the clip before, and its points. The
+        hand still holds it if they are in its grip in the first frame.
         """
         seen = seen_frames(joints_m)
         joints_m = complete_hand(joints_m, seen)
         tips, palm = joints_m[:, TIPS[kind]], joints_m[:, PALM[kind]]
         first = int(seen[0])
-        holds, sure = find_holds(tips[first : int(seen[-1]) + 1], tolerance_m)
+        carried = None
+        if before and first == 0 and in_grip(before[1], tips[0], eyes_m[0], radius_m):
+            carried = before[0]
+        holds, sure = find_holds(
+            tips[first : int(seen[-1]) + 1], tolerance_m, holding=carried is not None
+        )
         holds = [(grasped + first, released + first) for grasped, released in holds]
         return cls(
-            palm_m=palm, tips_m=tips, holds=holds, sure=sure, radius_m=radius_m, eyes_m=eyes_m
+            palm_m=palm,
+            tips_m=tips,
+            holds=holds,
+            sure=sure,
+            radius_m=radius_m,
+            eyes_m=eyes_m,
+            carried=carried,
         )
 
     @property
@@ -105,10 +121,7 @@ class Grip:
     def has(self, points_m: Float[np.ndarray, "n 3"], grasped: int) -> bool:
         """Return True if the hand surely holds an object that has these points at a grasp."""
         tips, eye = self.tips_m[grasped], self.eyes_m[grasped]
-        return self.sure and (
-            is_between(points_m, tips, self.radius_m)
-            or is_behind(points_m, tips, eye, self.radius_m)
-        )
+        return self.sure and in_grip(points_m, tips, eye, self.radius_m)
 
 
 def seen_frames(joints_m: Float[np.ndarray, "f j 3"]) -> Int[np.ndarray, " k"]:
@@ -131,7 +144,7 @@ def complete_hand(
 
 
 def find_holds(
-    tips_m: Float[np.ndarray, "f j 3"], tolerance_m: float
+    tips_m: Float[np.ndarray, "f j 3"], tolerance_m: float, *, holding: bool = False
 ) -> tuple[list[tuple[int, int]], bool]:
     """Return (grasp, release) frames of possible holds, and True if the hand surely held.
 
@@ -139,12 +152,15 @@ def find_holds(
     or at the first frame, and ends when it opens, or at the last frame. A hand that never closes
     may have held an object while its opening was steady. If the opening is always or never steady,
     or has noise as in a video, it is no evidence, and any two frames may be a hold: any two of some
-    frames of a long clip.
+    frames of a long clip. A hand that is `holding` something in the first frame, and whose opening
+    is always steady, holds it in all frames.
     """
     opening = np.linalg.norm(tips_m[:, 0] - tips_m[:, 1:].mean(axis=1), axis=-1)
     pairs = [(g, r) for g, r in combinations(range(len(tips_m)), 2) if r - g >= MIN_HELD]
     bends = np.abs(np.diff(opening, 2))
     noise = np.percentile(bends, 25) if len(bends) >= MIN_BENDS else 0.0
+    if holding and np.ptp(opening) <= tolerance_m:
+        return [(0, len(tips_m) - 1)], True
     if np.ptp(opening) <= tolerance_m or noise > MAX_NOISE * tolerance_m:
         ends = set(np.linspace(0, len(opening) - 1, MAX_ENDS).astype(int).tolist())
         return [pair for pair in pairs if ends.issuperset(pair)], False
@@ -155,6 +171,17 @@ def find_holds(
         (g, r) for g, r in longest if min(padded[g], padded[r + 2]) > opening[g : r + 1].mean()
     ]
     return closed or longest or pairs, bool(closed)
+
+
+def in_grip(
+    points_m: Float[np.ndarray, "n 3"],
+    tips_m: Float[np.ndarray, "j 3"],
+    eye_m: Float[np.ndarray, " 3"],
+    radius_m: float,
+) -> bool:
+    """Return True if the fingertips are around an object that has these points."""
+    between = is_between(points_m, tips_m, radius_m)
+    return between or is_behind(points_m, tips_m, eye_m, radius_m)
 
 
 def is_between(

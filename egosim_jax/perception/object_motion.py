@@ -109,18 +109,27 @@ class TrackObjects:
     def __call__(
         self, clip: Clip, action: Action, state: SceneState, so_far: Observation
     ) -> Observation:
-        """Set `motions`, `support_planes` and `interacted_frames`; pixels of hands are ignored."""
+        """Set `motions`, `support_planes`, `held` and `interacted_frames`.
+
+        Pixels of hands are ignored.
+        """
         cameras, joints, ids = (
             so_far.require(name, "TrackObjects") for name in ("cameras", "joints_m", "object_ids")
         )
         action = replace(action, cameras=cameras, joints_m=joints)
-        moved, new, notes = estimate_object_motion(clip, action, state, ids < 0, self)
-        frames = np.arange(len(clip.frames))
+        found, new, notes = estimate_object_motion(clip, action, state, ids < 0, self)
+        frames, moved = np.arange(len(clip.frames)), list(found.values())
+        held = {hand: motion.model.number for hand, motion in found.items() if motion.holds_to_end}
+        for hand, number in state.held.items():
+            in_view = hand < joints.shape[1] and len(seen_frames(joints[:, hand]))
+            if not in_view:
+                held[hand] = number
         return replace(
             so_far,
             new_objects=new,
             names={**(so_far.names or {}), **{number: object_name(number, {}) for number in new}},
             notes=(*so_far.notes, *notes),
+            held=held,
             motions={m.model.number: m.path for m in moved},
             support_planes={m.model.number: m.model.plane for m in moved},
             interacted_frames={
@@ -135,8 +144,8 @@ def estimate_object_motion(
     state: SceneState,
     hidden: Bool[np.ndarray, "f h w"],
     config: TrackObjects,
-) -> tuple[list[ObjectMotion], dict[int, Float32[np.ndarray, "n 3"]], list[str]]:
-    """Return the motions of the objects that hands moved, the new objects' points, and notes.
+) -> tuple[dict[int, ObjectMotion], dict[int, Float32[np.ndarray, "n 3"]], list[str]]:
+    """Return the motion of the object that each hand moved, the new objects' points, and notes.
 
     Each hand moves at most one object. If two hands claim an object, the hand that explains the
     colors better gets it. `hidden` marks the pixels that hands cover. A hand may
@@ -144,13 +153,13 @@ def estimate_object_motion(
     a new one: it gets the next free id.
     """
     shown = _smooth(clip.frames, config.blur_px)
-    found: dict[int, tuple[float, ObjectMotion]] = {}
+    found: dict[int, tuple[float, int, ObjectMotion]] = {}
     new: dict[int, Float32[np.ndarray, "n 3"]] = {}
     notes: list[str] = []
     for hand in range(action.joints_m.shape[1]):
         joints = action.joints_m[:, hand]
         if len(seen_frames(joints)) > MIN_HELD:
-            best, note = _best_candidate(joints, action, state, shown, hidden, config)
+            best, note = _best_candidate(hand, action, state, shown, hidden, config)
             if best is not None and best[1].model.number == NEW:
                 change, motion = best
                 number = next_object_id(state)
@@ -171,12 +180,12 @@ def estimate_object_motion(
                 motion = snap(motion, others)
                 number = motion.model.number
                 if number not in found or change < found[number][0]:
-                    found[number] = change, motion
-    return [motion for _, motion in found.values()], new, notes
+                    found[number] = change, hand, motion
+    return {hand: motion for _, hand, motion in found.values()}, new, notes
 
 
 def _best_candidate(
-    joints_m: Float[np.ndarray, "f j 3"],
+    hand: int,
     action: Action,
     state: SceneState,
     shown: Float32[np.ndarray, "f h w 3"],
@@ -187,12 +196,14 @@ def _best_candidate(
 
     If the hand holds no object that has an id, it may move one that has none.
     """
+    before = state.held.get(hand, 0)
     grip = Grip.of(
-        joints_m,
+        action.joints_m[:, hand],
         action.kind,
         action.cameras.world_from_camera[:, :3, 3],
         tolerance_m=config.opening_tolerance_m,
         radius_m=config.grip_radius_m,
+        before=(before, state.points_m[state.object_ids == before]) if before else None,
     )
     scene = action.cameras, state, shown, hidden, config.color
     found: list[list[Candidate]] = []
@@ -249,7 +260,9 @@ def _best_motions(
     for hold in grip.holds:
         gripped = grip.has(model.points_m, hold[0])
         max_change = config.grip_evidence if gripped else -improvement
-        if gripped and faces is not None and is_firm(faces, grip.tips_m, hold):
+        carried = hold[0] == 0 and grip.carried == model.number
+        firm = faces is not None and is_firm(faces, grip.tips_m, hold)
+        if gripped and (carried or firm):
             max_change = config.firm_evidence
         loose = couplings(grip.palm_m, grip.rigid[hold[0]], model.plane[:3], hold)
         hinge = grip.hinges[hold]
@@ -296,7 +309,10 @@ def object_model(
     config: TrackObjects,
     world_from_camera: Float[np.ndarray, "4 4"],
 ) -> ObjectModel:
-    """Return the model of an object. Its plane is horizontal if no surface is around it."""
+    """Return the model of an object. Its plane is horizontal if no surface is around it.
+
+    An object in a hand last rested where it was first observed, as far as the state knows.
+    """
     own = state.object_ids == number
     points = state.points_m[own].astype(float)
     return ObjectModel(
@@ -306,7 +322,19 @@ def object_model(
         plane=_support_plane(
             points, state.points_m[~own], config, *upward(state, world_from_camera)
         ),
+        since_rest=_since_rest(number, points, state),
     )
+
+
+def _since_rest(
+    number: int, points_m: Float[np.ndarray, "n 3"], state: SceneState
+) -> Float[np.ndarray, "4 4"] | None:
+    """Return the motion of an object in a hand since it rested; None for others and on a hinge."""
+    pose = state.world_from_object.get(number)
+    if pose is None or number not in state.held.values():
+        return None
+    rested = transform(invert(pose), points_m)
+    return None if is_along_edge(rested, pose[None]) else pose
 
 
 def _support_plane(

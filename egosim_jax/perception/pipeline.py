@@ -55,6 +55,8 @@ class Observation:
     """Object names by id; names that the state has may be omitted."""
     new_objects: Mapping[int, Float32[np.ndarray, "n 3"]] = field(default_factory=dict)
     """Points of the state that are an object without an id, by its new id."""
+    held: Mapping[int, int] = field(default_factory=dict)
+    """Object that each hand holds in the last frame, by the hand's index in the action."""
     notes: tuple[str, ...] = ()
     """New objects, and what could not be decided, in words for reports."""
 
@@ -80,6 +82,7 @@ class Observation:
             step=state.step + 1,
             frames=clip.frames,
             new_objects=self.new_objects,
+            held=self.held,
             notes=self.notes,
             world_from_object={
                 number: motion @ state.world_from_object.get(number, np.eye(4))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from egosim_jax.geometry import cameras_in_object_frame, transform
+from egosim_jax.geometry import cameras_in_object_frame, invert, transform
 from egosim_jax.rendering.reference import splat
 from egosim_jax.state.fuse import dilate
 from egosim_jax.types import Cameras, InputError, SceneState, check_counts
@@ -90,6 +90,15 @@ class ObjectModel:
     colors: Float32[np.ndarray, "n 3"]
     plane: Float[np.ndarray, " 4"]
     """Supporting plane a x + b y + c z + d = 0; d is NaN if there is no plane."""
+    since_rest: Float[np.ndarray, "4 4"] | None = None
+    """Motion before the clip of an object in a hand, since it rested on a surface."""
+
+    @property
+    def rested_m(self) -> Float[np.ndarray, "n 3"]:
+        """Points where the object last rested on a surface."""
+        if self.since_rest is None:
+            return self.points_m
+        return transform(invert(self.since_rest), self.points_m)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,10 +116,15 @@ class ObjectMotion:
     """True for a part that turns about an axis and stays on it, such as a lid."""
 
     @property
+    def holds_to_end(self) -> bool:
+        """True if the hand still holds the object in the last frame."""
+        return self.released == len(self.path) - 1
+
+    @property
     def lands(self) -> bool:
         """True if the object is put down on a known surface before the clip ends."""
-        released = self.released < len(self.path) - 1
-        return released and not self.hinged and bool(np.isfinite(self.model.plane[3]))
+        known = bool(np.isfinite(self.model.plane[3]))
+        return known and not self.holds_to_end and not self.hinged
 
     @property
     def carried(self) -> Float[np.ndarray, " f"]:

@@ -76,6 +76,7 @@ def fuse(state: SceneState, perceived: Perceived, *, fusion: Fusion | None = Non
         step=max(state.step, perceived.step),
         names={**state.names, **perceived.names},
         world_from_object={**state.world_from_object, **poses},
+        held=dict(perceived.held),
     )
 
 

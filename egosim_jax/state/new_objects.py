@@ -20,7 +20,7 @@ def next_object_id(state: SceneState) -> int:
 def without_ids(state: SceneState) -> SceneState:
     """Return the state with all points in the background, as a camera sees them."""
     return replace(
-        state, object_ids=np.zeros_like(state.object_ids), names={}, world_from_object={}
+        state, object_ids=np.zeros_like(state.object_ids), names={}, world_from_object={}, held={}
     )
 
 

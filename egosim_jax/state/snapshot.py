@@ -130,8 +130,15 @@ def _checked(written: Mapping[str, Any]) -> dict[str, Any]:
             _number(number): _matrix(pose, 4, f"the pose of object {quote_text(number)}")
             for number, pose in poses.items()
         },
+        "held": _held(written.get("held", {})),
         "provenance": provenance,
     }
+
+
+def _held(hands: Any) -> dict[int, int]:
+    if not isinstance(hands, dict) or not all(type(number) is int for number in hands.values()):
+        raise ValueError("held is not a mapping from hands to object ids")
+    return {_number(hand): number for hand, number in hands.items()}
 
 
 def _number(text: str) -> int:
@@ -154,6 +161,7 @@ def _matrix(rows: Any, size: int, name: str) -> np.ndarray:
 
 
 def _description(state: SceneState) -> dict[str, Any]:
+    held = {str(hand): int(state.held[hand]) for hand in sorted(state.held)}
     return {
         "step": int(state.step),
         "names": {str(number): state.names[number] for number in sorted(state.names)},
@@ -162,6 +170,7 @@ def _description(state: SceneState) -> dict[str, Any]:
             for number in sorted(state.world_from_object)
         },
         "intrinsics_px": np.asarray(state.intrinsics_px).tolist(),
+        **({"held": held} if held else {}),  # a state without equals one of before the field
         "provenance": dict(state.provenance),
     }
 

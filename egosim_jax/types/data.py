@@ -36,6 +36,8 @@ class SceneState:
     """Names of object instances, by id."""
     world_from_object: Mapping[int, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
     """Poses of the objects that have moved, relative to where they were first observed."""
+    held: Mapping[int, int] = field(default_factory=dict)
+    """Object that each hand held at the end of the last clip, by the hand's index in the action."""
     provenance: Mapping[str, str] = field(default_factory=dict)
     """Origin of the state, as free key-value pairs."""
 
@@ -255,6 +257,8 @@ class Perceived:
     """Frames in which hands acted on each object; objects without any are absent."""
     new_objects: Mapping[int, Float32[np.ndarray, "n 3"]] = field(default_factory=dict)
     """Points of the state before the clip that the clip shows to be an object, by its new id."""
+    held: Mapping[int, int] = field(default_factory=dict)
+    """Object that each hand holds in the last frame, by the hand's index in the action."""
     notes: tuple[str, ...] = ()
     """New objects, and what could not be decided, in words for reports."""
 

@@ -1,12 +1,10 @@
-"""Seconds from the command to the first clip of `tabletop`, the first time and the second.
+"""Seconds of `egosim simulate` to its first line, its first clip and its end, cold and warm.
 
-    python -m tests.benchmarks.bench_start [--pairs 3]
+    python -m tests.benchmarks.bench_start [--pairs 3] [--against CHECKOUT]
 
-The first start has an empty cache and compiles; the second finds its programs. Both make the same
-scene, draw it, read weights, generate and write the clip, which is what the seconds end with.
+The first start has an empty cache and compiles; the second finds its programs. Both simulate three
+clips of the tabletop world. `--against` runs another checkout in turn, with a separate cache.
 """
-
-from __future__ import annotations
 
 import argparse
 import os
@@ -17,44 +15,60 @@ import tempfile
 import time
 from pathlib import Path
 
+HERE = Path(__file__).resolve().parents[2]
+MAIN = "import sys; from egosim_jax.cli.__main__ import main; sys.exit(main())"
+COLUMNS = ("first line", "first clip", "end")
 
-def start(cache: Path, out: Path) -> tuple[float, int]:
-    """Seconds until the first clip is named, and how many programs were compiled."""
-    command = [sys.executable, "-m", "egosim_jax.cli", "generate", "--config", "tabletop"]
-    env = {**os.environ, "XDG_CACHE_HOME": str(cache), "JAX_LOG_COMPILES": "1"}
-    errors = out.with_suffix(".log")
-    begun = time.perf_counter()
-    with errors.open("w") as log:
-        program = subprocess.Popen(
-            [*command, "--out", str(out)], env=env, stdout=subprocess.PIPE, stderr=log, text=True
-        )
+
+def start(checkout: Path, cache: Path, out: Path) -> tuple[float, float, float]:
+    """Seconds of one run of a checkout until each of `COLUMNS`."""
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(checkout),
+        "PYTHONUNBUFFERED": "1",
+        "XDG_CACHE_HOME": str(cache),
+    }
+    begun, seconds = time.perf_counter(), []
+    with subprocess.Popen(
+        [sys.executable, "-P", "-c", MAIN, "simulate", "--out", str(out)],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    ) as program:
         assert program.stdout is not None
-        clip = next(line for line in program.stdout if line.strip().endswith(".mp4"))
-        seconds = time.perf_counter() - begun
-        program.stdout.read()
-        program.wait()
-    assert Path(clip.strip()).exists()
-    return seconds, errors.read_text("utf-8").count("Finished XLA compilation")
+        for line in program.stdout:
+            now = time.perf_counter() - begun
+            if not seconds:
+                seconds.append(now)
+            if len(seconds) == 1 and ("clip_1.mp4" in line or "clip 1/" in line):
+                seconds.append(now)
+    assert program.returncode == 0, f"simulate of {checkout} failed"
+    first, clip = seconds
+    return first, clip, time.perf_counter() - begun
 
 
 def main() -> None:
-    """Print each pair and the medians."""
+    """Print each run and the medians."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--pairs", type=int, default=3)
-    pairs = []
-    for number in range(parser.parse_args().pairs):
-        with tempfile.TemporaryDirectory() as folder:
-            cache = Path(folder) / "cache"
-            pair = [start(cache, Path(folder) / name) for name in ("cold", "warm")]
-        pairs.append(pair)
-        (cold, made), (warm, again) = pair
-        print(
-            f"pair {number + 1}: cold {cold:.1f} s, {made} programs compiled; warm {warm:.1f} s, "
-            f"{again} compiled",
-            flush=True,
-        )
-    cold, warm = (statistics.median(pair[i][0] for pair in pairs) for i in (0, 1))
-    print(f"median: cold {cold:.1f} s, warm {warm:.1f} s, ratio {warm / cold:.2f}")
+    parser.add_argument("--against", type=Path, help="Another checkout of this package.")
+    given = parser.parse_args()
+    checkouts = [HERE, *([given.against.resolve()] if given.against else [])]
+    runs: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for number in range(given.pairs):
+            for index, checkout in enumerate(checkouts):
+                cache = Path(folder) / f"cache_{number}_{index}"
+                for kind in ("cold", "warm"):
+                    out = Path(folder) / f"{kind}_{number}_{index}"
+                    run = start(checkout, cache, out)
+                    runs.setdefault((checkout.name, kind), []).append(run)
+                    print(checkout.name, kind, *(f"{seconds:.2f}" for seconds in run), flush=True)
+    print(f"medians of {given.pairs}, in seconds: {', '.join(COLUMNS)}")
+    for (name, kind), measured in runs.items():
+        medians = (statistics.median(column) for column in zip(*measured, strict=True))
+        print(f"{name}, {kind}: {', '.join(f'{median:.2f}' for median in medians)}")
 
 
 if __name__ == "__main__":

@@ -55,6 +55,13 @@ def test_a_hand_that_does_not_close_is_less_evidence(opening_cm, count):
     assert not sure
 
 
+def test_a_steady_hand_that_held_something_before_still_holds_it():
+    opening_cm = [7, 7.4, 7, 7.2, 7]
+    assert find_holds(fingers(opening_cm), TOLERANCE_M, holding=True) == ([(0, 4)], True)
+    opened = [4, 4, 4, 9, 9.5, 9]
+    assert find_holds(fingers(opened), TOLERANCE_M, holding=True) == ([(0, 2)], True)
+
+
 @pytest.mark.parametrize(
     ("point_cm", "between"),
     [

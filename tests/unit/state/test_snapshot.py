@@ -21,6 +21,7 @@ def state(count=50):
         step=4,
         names={1: "red cup", 2: "lid"},
         world_from_object={2: np.diag([-1.0, -1, 1, 1])},
+        held={0: 2},
         provenance={"world": "tabletop"},
     )
 
@@ -38,6 +39,7 @@ def test_a_state_that_is_read_equals_the_one_written(tmp_path):
         {"world": "tabletop"},
     )
     np.testing.assert_array_equal(again.world_from_object[2], np.diag([-1.0, -1, 1, 1]))
+    assert again.held == {0: 2}
 
 
 def test_a_state_is_replaced_atomically(tmp_path):
@@ -54,6 +56,8 @@ def test_a_state_is_replaced_atomically(tmp_path):
         {"names": {1: "blue cup", 2: "lid"}},
         {"colors": np.zeros((50, 3), np.uint8)},
         {"world_from_object": {}},
+        {"held": {1: 2}},
+        {"held": {}},
     ],
 )
 def test_any_change_changes_the_fingerprint(change):
@@ -89,6 +93,10 @@ def test_another_version_is_named(tmp_path):
         {"provenance": {"world": None}},
         {"world_from_object": {"2": [[1, 0], [0, 1]]}},
         {"world_from_object": None},
+        {"held": []},
+        {"held": {"0": "2"}},
+        {"held": {"0": 1}},
+        {"held": {"left": 2}},
         {"intrinsics_px": "eye"},
         {"intrinsics_px": [[1, 0, 0], [0, 1, 0], [0, 0, None]]},
         {"points": 7},
