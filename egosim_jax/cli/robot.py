@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -99,10 +100,7 @@ class Render:
         seconds = round(time.monotonic() - began, 1)
         write_json(self.out / REPORT, {**report, "seconds": seconds})
         for entry in report["robots"]:
-            print(
-                f"{entry['robot']} reaches {entry['reached']:.1%} of {entry['frames']} frames, "
-                f"{1000 * entry['pinch_error_m']['max']:.1f} mm off at most"
-            )
+            print(_words(entry))
         if not any(entry["reached"] for entry in report["robots"]):
             raise InputError(
                 f"{arm.title} reaches the hand in no frame: see {self.out / REPORT}. Use another "
@@ -110,6 +108,22 @@ class Render:
             )
         print(self.out)
         return ExitCode.DONE
+
+
+def _words(entry: Mapping[str, Any]) -> str:
+    """Return what the report says of one robot, in a line."""
+    frames, missing, near = (
+        entry[name] for name in ("frames", "frames_without_hand", "frames_at_camera")
+    )
+    words = (
+        f"{entry['robot']} for hand {entry['hand']} reaches {entry['reached']:.1%} of "
+        f"{frames - missing} frames, {1000 * entry['pinch_error_m']['max']:.1f} mm off at most"
+    )
+    if missing:
+        words += f"; it waits in {missing} frames in which the hand was not found, nor removed"
+    if near:
+        words += f"; in {near} frames it is at the camera: try another base (--base)"
+    return words
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -221,6 +221,7 @@ def _report(follower: Follower, fps: int) -> dict[str, Any]:
         "world_from_base": base.round(6).tolist(),
         "frames": len(joints),
         "frames_without_hand": int((~grips.seen).sum()),
+        "frames_at_camera": int((~follower.placed.clear).sum()),
         "reached": float(track.reached[grips.seen].mean()),
         "missed_frames": {int(n): round(float(track.error_m[n]), 5) for n in missed},
         "pinch_error_m": {"median": float(np.nanmedian(error)), "max": float(np.nanmax(error))},

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import import_module
+from itertools import product
 from typing import Any, no_type_check
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from egosim_jax.geometry import invert, transform
 from egosim_jax.robots.ik import REACHED_M, Solver, Track
-from egosim_jax.robots.models import RobotModel, grip_of
+from egosim_jax.robots.models import TABLE, RobotModel, grip_of
 from egosim_jax.robots.retarget import Grips
 
 ANGLES = np.radians([0, 30, -30, 60, -60, 90, -90, 135, -135, 180])
@@ -47,6 +48,8 @@ class Placed:
     """Pose of the base."""
     track: Track
     """Motion in the base frame."""
+    clear: Bool[np.ndarray, " f"]
+    """Mask of the frames in which no link is at the camera."""
 
 
 def place(
@@ -58,7 +61,7 @@ def place(
     fps: int,
     base: Base | None = None,
 ) -> Placed:
-    """Return the base from which the arm reaches most of the path, and the motion.
+    """Return the base from which the arm reaches most of the path, clear of the camera.
 
     `world_from_up` is a frame on the table, z upwards. `eyes_m` are the centers of the camera.
     By default, `base` is searched.
@@ -87,10 +90,32 @@ def place(
     for _, _, up_from_base, path, start in tried[:MAX_TRACKS]:
         solver = Solver(robot, table_m=-up_from_base[2, 3])
         track = solver.follow(start, path, grips.opening_m, fps=fps)
-        found.append(Placed(world_from_base=world_from_up @ up_from_base, track=track))
-        if track.reached[grips.seen].mean() >= ENOUGH:
+        clear = _clear(solver, track, transform(invert(up_from_base), eyes))
+        found.append(Placed(world_from_base=world_from_up @ up_from_base, track=track, clear=clear))
+        if track.reached[grips.seen].mean() >= ENOUGH and clear.mean() >= ENOUGH:
             break
-    return max(found, key=lambda placed: placed.track.reached[grips.seen].sum())
+    return max(
+        found, key=lambda placed: placed.track.reached[grips.seen].mean() + placed.clear.mean()
+    )
+
+
+def _clear(solver: Solver, track: Track, eyes: np.ndarray) -> Bool[np.ndarray, " f"]:
+    """Return in which frames no link is within `EYE_M` of the camera, in any of 26 directions."""
+    mujoco: Any = import_module("mujoco")
+
+    mj, clear = solver.robot.mj, []
+    data, table = mujoco.MjData(mj), mj.geom(TABLE).id
+    rays = np.array([ray for ray in product((-1.0, 0.0, 1.0), repeat=3) if any(ray)])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    hits, distances = np.zeros(len(rays), np.int32), np.zeros(len(rays))
+    for q, opening, eye in zip(track.q, track.opening_m, eyes, strict=True):
+        data.qpos[:] = solver.robot.open(q, float(opening))
+        mujoco.mj_kinematics(mj, data)
+        mujoco.mj_multiRay(
+            mj, data, eye, rays.ravel(), None, True, -1, hits, distances, None, len(rays), EYE_M
+        )
+        clear.append(not ((hits >= 0) & (hits != table) & (distances < EYE_M)).any())
+    return np.array(clear)
 
 
 def _try(

@@ -107,7 +107,18 @@ def test_a_base_is_found_from_which_the_whole_path_is_reached(toy):
     eyes = np.tile([0.0, -0.2, 0.5], (FRAMES, 1))
     placed = place(toy, grips, world_from_up=np.eye(4), eyes_m=eyes, fps=FPS)
     assert placed.track.reached.all()
+    assert placed.clear.all()
     base = (*placed.world_from_base[:2, 3], 0.0, 0.0)
     given = place(toy, grips, world_from_up=np.eye(4), eyes_m=eyes, fps=FPS, base=base)
     np.testing.assert_allclose(given.world_from_base[:3, 3], base[:3])
     np.testing.assert_allclose(given.world_from_base[:3, :3], np.eye(3))
+
+
+def test_frames_in_which_the_arm_is_at_the_camera_are_known(toy):
+    poses = path_to([0.1, 0.3, 0.15], [-0.1, 0.3, 0.05], [0.0, 0.2, 0.15])
+    grips = grips_of(gripper(poses, 0.06), fps=FPS)
+    eyes = np.tile([0.0, -0.2, 0.5], (FRAMES, 1))
+    eyes[5] = poses[5, :3, 3] + [0, 0, 0.03]  # between the jaws
+    base = (0.0, -0.1, 0.0, 90.0)
+    placed = place(toy, grips, world_from_up=np.eye(4), eyes_m=eyes, fps=FPS, base=base)
+    np.testing.assert_array_equal(np.flatnonzero(~placed.clear), [5])
