@@ -10,6 +10,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from importlib import import_module
+from typing import Any
 
 from egosim_jax.runtime.phases import phase, show_phases
 
@@ -43,21 +44,31 @@ def main(args: Sequence[str] | None = None) -> int:
     if not given:
         print(START)
         return 0
-    with ExitStack() as starting:
-        if given[0] in ANNOUNCED and not {"-h", "--help"} & {*given}:
-            starting.enter_context(show_phases())
-        starting.enter_context(phase(f"starts egosim {given[0]}"))
-        if given[0] in PROGRAMS:
-            run = import_module(PROGRAMS[given[0]]).main
-        else:
-            run = import_module("egosim_jax.cli.commands").run
-    if given[0] not in PROGRAMS:
-        return run(args, programs=PROGRAMS)
     program = f"egosim {given[0]}"
+    module = PROGRAMS.get(given[0], "egosim_jax.cli.commands")
+    loaded = _load(module, program, announced=given[0] in ANNOUNCED, options=given)
+    if given[0] not in PROGRAMS:
+        return loaded.run(args, programs=PROGRAMS)
+    run = loaded.main
     if args is not None:
         return run(given[1:], program=program)
     sys.argv = [program, *given[1:]]
     return run(program=program)
+
+
+def train() -> int:
+    """Run the program `egosim-train`; return its exit code."""
+    loaded = _load(PROGRAMS["train"], "egosim-train", announced=True, options=sys.argv)
+    return loaded.main()
+
+
+def _load(module: str, program: str, *, announced: bool, options: Sequence[str]) -> Any:
+    """Import a module, and print before it, if it loads for seconds, that its program starts."""
+    with ExitStack() as starting:
+        if announced and not {"-h", "--help"} & {*options}:
+            starting.enter_context(show_phases())
+        starting.enter_context(phase(f"starts {program}"))
+        return import_module(module)
 
 
 if __name__ == "__main__":
