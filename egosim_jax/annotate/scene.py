@@ -149,7 +149,14 @@ def find_moved_objects(record: Record, estimators: Estimators, config: AnnotateC
     found = []
     if record.hands is not None and visible(record.hands).any():
         depth_m = record.require("depth").depth_m[0]
-        found = find_moved(record.frames, record.moving, record.hands, record.cameras, depth_m)
+        found = find_moved(
+            record.frames,
+            record.moving,
+            record.hands,
+            record.cameras,
+            depth_m,
+            fps=float(record.fps),
+        )
     numbers: list[int] = []
     contacts: list[tuple[int, int, int]] = []
     for moved in found:

@@ -24,6 +24,8 @@ TIPS: dict[Kind, list[int]] = {"human": [4, 8, 12], "robot": [1, 2]}
 """Grasping joints: tips of thumb, index and middle finger; both jaws of a gripper."""
 MIN_HELD = 2
 """Minimum number of frames between a grasp and a release."""
+CLOSING_M = 0.001
+"""Minimum change of the opening of a hand that closes, in meters per frame."""
 MAX_NOISE = 0.1
 """Maximum noise of the opening: the 25th percentile of its bends, in tolerances of a hold."""
 MIN_BENDS = 8
@@ -170,6 +172,8 @@ def find_holds(
     closed = [
         (g, r) for g, r in longest if min(padded[g], padded[r + 2]) > opening[g : r + 1].mean()
     ]
+    if opening[-2] - opening[-1] > CLOSING_M:  # a hand that still closes has not held yet
+        closed = [hold for hold in closed if hold[1] < len(opening) - 1]
     return closed or longest or pairs, bool(closed)
 
 
@@ -243,13 +247,37 @@ def is_firm(
     must touch the hull, with the middle between them inside it.
     """
     grasped, released = hold
-    thumb, fingers = tips_m[:, 0], tips_m[:, 1:].mean(axis=1)
-    middle = (thumb + fingers) / 2
+    middle = (tips_m[:, 0] + tips_m[:, 1:].mean(axis=1)) / 2
     carried = middle[grasped : released + 1] - middle[grasped]
-    places = np.stack([thumb[grasped], fingers[grasped], middle[grasped]])
-    outside = (places @ faces[:, :3].T + faces[:, 3]).max(axis=1)
-    touched = np.abs(outside[:2]).max() <= FIRM_TOUCH_M and outside[2] < 0
-    return bool(touched and np.linalg.norm(carried, axis=1).max() >= FIRM_TRAVEL_M)
+    far = np.linalg.norm(carried, axis=1).max() >= FIRM_TRAVEL_M
+    return bool(far and touches(faces, tips_m[grasped]))
+
+
+def touches(faces: Float[np.ndarray, "m 4"], tips_m: Float[np.ndarray, "j 3"]) -> bool:
+    """Return True if thumb and fingers touch a hull of these outward planes from two sides."""
+    outside = _outside(faces, tips_m)
+    return bool(np.abs(outside[:2]).max() <= FIRM_TOUCH_M and outside[2] < 0)
+
+
+def encloses(faces: Float[np.ndarray, "m 4"], tips_m: Float[np.ndarray, "j 3"]) -> bool:
+    """Return True if thumb and fingers touch a hull from two sides, or are inside it."""
+    outside = _outside(faces, tips_m)
+    return bool(outside[:2].max() <= FIRM_TOUCH_M and outside[2] < 0)
+
+
+def _outside(
+    faces: Float[np.ndarray, "m 4"], tips_m: Float[np.ndarray, "j 3"]
+) -> Float[np.ndarray, " 3"]:
+    """Return how far thumb, fingers and their middle are outside a hull; negative inside."""
+    thumb, fingers = tips_m[0], tips_m[1:].mean(axis=0)
+    places = np.stack([thumb, fingers, (thumb + fingers) / 2])
+    return (places @ faces[:, :3].T + faces[:, 3]).max(axis=1)
+
+
+def closes_to_end(tips_m: Float[np.ndarray, "f j 3"], tolerance_m: float) -> bool:
+    """Return True if a hand closes, by more than a tolerance, until the last frame."""
+    opening = np.linalg.norm(tips_m[:, 0] - tips_m[:, 1:].mean(axis=1), axis=-1)
+    return bool(opening[-1] <= opening.min() and opening[-1] < opening.max() - tolerance_m)
 
 
 def palm_motion(palm_m: Float[np.ndarray, "f j 3"], grasped: int) -> Float[np.ndarray, "f 4 4"]:

@@ -21,6 +21,8 @@ from egosim_jax.perception.pose_refinement import ObjectModel
 from egosim_jax.state.planes import support_planes
 from egosim_jax.types import Cameras, SceneState
 
+NOTHING = "closed on nothing"
+"""Note of a hand that closes and has no points in its grip."""
 NEW = 0
 """Number of an object that has no id yet."""
 SEAM_COLORS = 8
@@ -183,7 +185,7 @@ class Surroundings:
         A grip is the places of the fingertips. The note says why there is no growth.
         """
         clusters: dict[int, list[ObjectModel]] = {}
-        notes = ["closed on nothing"]
+        notes = [NOTHING]
         everything = np.ones(len(self.points_m), bool)
         parts = self.parts(everything) if len(everything) > 1 else np.zeros(len(everything), int)
         for tips in grips:
@@ -364,6 +366,7 @@ def clusters_without_id(
     """
     from scipy.spatial import KDTree
 
+    closed = grip.sure and max(grip.grasps) > 0  # not a hand that was closed and only opens
     pinches = grip.tips_m[grip.grasps].mean(axis=1)
     low, high = pinches.min(axis=0) - config.max_extent_m, pinches.max(axis=0) + config.max_extent_m
     within = ((state.points_m >= low) & (state.points_m <= high)).all(axis=1)
@@ -371,10 +374,10 @@ def clusters_without_id(
     gaps, _ = KDTree(pinches).query(state.points_m[free])
     free = free[gaps <= config.max_extent_m]
     if len(free) < config.min_points:
-        return [], "closed on nothing" if grip.sure else ""
+        return [], NOTHING if closed else ""
     around = Surroundings.of(state, free, cameras.world_from_camera[0], config)
     clusters, note = around.touched([grip.tips_m[frame] for frame in grip.grasps])
-    return clusters, note if grip.sure else ""
+    return clusters, note if closed or (grip.sure and note != NOTHING) else ""
 
 
 def seeds_between(

@@ -9,11 +9,11 @@ An object that moves with the hand and continues to the border of the image is t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from egosim_jax.perception.cameras.flow import Background, background
 from egosim_jax.perception.estimates import HandTracks
@@ -28,6 +28,8 @@ from egosim_jax.perception.moved_pixels import (
 )
 from egosim_jax.types import Cameras
 
+FOLLOWED_FPS = 10.0
+"""Least rate of the frames in which corners are followed: with more steps, they drift."""
 CORNERS, QUALITY, APART_PX = 1500, 0.002, 4
 """Maximum number of corners, their minimum relative strength, and their minimum distance."""
 MAX_OBJECTS = 4
@@ -53,6 +55,8 @@ class Moved:
 
     first: Bool[np.ndarray, "h w"]
     """Pixels of the object in the first frame."""
+    start: Float32[np.ndarray, "n 2"]
+    """Corners of the object in the first frame."""
     shown: Bool[np.ndarray, "f h w"]
     """Pixels of the object in each frame, also where a hand may be in front of it."""
     motion_px: Float[np.ndarray, "f 2 3"]
@@ -79,12 +83,47 @@ def find_moved(
     hands: HandTracks,
     cameras: Cameras,
     depth_m: Float[np.ndarray, "h w"],
+    *,
+    fps: float,
 ) -> list[Moved]:
     """Return the objects of the first frame that hands move later, the largest group first.
 
     `hidden` are the pixels of hands, and `depth_m` is the depth of the first frame in the unit of
     the cameras. Objects without texture, and objects that turn away from the camera, may be missed.
+    At a high frame rate, every second or n-th frame is searched, and motions are interpolated.
     """
+    every = max(1, int(fps // FOLLOWED_FPS))
+    keys = np.union1d(np.arange(0, len(frames), every), [len(frames) - 1])
+    found = _find_moved(
+        frames[keys],
+        hidden[keys],
+        replace(hands, **{n: x[keys] for n, x in vars(hands).items() if x is not None}),
+        replace(cameras, world_from_camera=cameras.world_from_camera[keys]),
+        depth_m,
+    )
+    return [_in_all_frames(moved, keys, hands) for moved in found]
+
+
+def _in_all_frames(moved: Moved, keys: Int[np.ndarray, " k"], hands: HandTracks) -> Moved:
+    """Return an object that was followed in some frames, in all of them."""
+    if len(keys) == len(hands.joints_px):
+        return moved
+    every = np.arange(len(hands.joints_px))
+    flat = moved.motion_px.reshape(len(keys), -1)
+    motion = np.stack([np.interp(every, keys, column) for column in flat.T], axis=1)
+    motion = motion.reshape(-1, 2, 3)
+    contacts = _contacts(moved.start, motion, hands, moved.first.shape[1])
+    shown = np.stack([warp(moved.first, matrix) for matrix in motion])
+    return replace(moved, motion_px=motion, shown=shown, contacts=contacts)
+
+
+def _find_moved(
+    frames: UInt8[np.ndarray, "f h w 3"],
+    hidden: Bool[np.ndarray, "f h w"],
+    hands: HandTracks,
+    cameras: Cameras,
+    depth_m: Float[np.ndarray, "h w"],
+) -> list[Moved]:
     video = background(frames, hidden)
     tracks = _follow(video, _corners(video, hands), cameras, depth_m)
     away = np.linalg.norm(tracks.places - tracks.resting, axis=-1)
@@ -110,7 +149,14 @@ def find_moved(
             worn = _touches_border(first) and bool((first & grown(hidden[0], 5)).any())
             contacts = _contacts(start, motion, hands, width)
             found.append(
-                Moved(first=first, shown=shown, motion_px=motion, contacts=contacts, worn=worn)
+                Moved(
+                    first=first,
+                    start=start,
+                    shown=shown,
+                    motion_px=motion,
+                    contacts=contacts,
+                    worn=worn,
+                )
             )
     return found
 

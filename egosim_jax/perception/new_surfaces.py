@@ -32,7 +32,9 @@ class NewSurfaces:
     """Stage that sets the depth of pixels that continue a plane of the state."""
 
     max_frames: int = 9
-    """Maximum number of frames that are searched, evenly spaced."""
+    """Maximum number of frames that are searched, evenly spaced, without the last ones."""
+    last_frames: int = 3
+    """Number of last frames that are searched too: as many as fusion asks for, at least."""
     max_planes: int = 4
     """Maximum number of planes of the background."""
     tolerance_m: float = 0.006
@@ -67,8 +69,8 @@ class NewSurfaces:
     def __post_init__(self) -> None:
         """Check that the counts are positive."""
         names = (
-            "max_frames", "max_planes", "min_points", "plane_points", "compared_points", "bin",
-            "min_bin", "min_wall",
+            "max_frames", "last_frames", "max_planes", "min_points", "plane_points",
+            "compared_points", "bin", "min_bin", "min_wall",
         )  # fmt: skip
         check_counts({name: getattr(self, name) for name in names})
 
@@ -81,9 +83,9 @@ class NewSurfaces:
             for name in ("cameras", "object_ids", "depth_m", "motions", "support_planes")
         )
         count = len(clip.frames)
-        chosen = np.unique(
-            np.linspace(0, count - 1, min(count, self.max_frames)).round().astype(int)
-        )
+        chosen = np.linspace(0, count - 1, min(count, self.max_frames)).round().astype(int)
+        # What a moved object uncovers late is in few frames.
+        chosen = np.union1d(chosen, np.arange(max(0, count - self.last_frames), count))
         motions = {number: motion[chosen] for number, motion in motions.items()}
         cameras = replace(cameras, world_from_camera=cameras.world_from_camera[chosen])
         depth, ids = depth.copy(), ids.copy()

@@ -13,6 +13,7 @@ its last pose.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -30,8 +31,12 @@ from egosim_jax.perception.extent import (
 from egosim_jax.perception.falling import fall, snap
 from egosim_jax.perception.grasps import (
     MIN_HELD,
+    TIPS,
     Grip,
+    closes_to_end,
+    complete_hand,
     couplings,
+    encloses,
     is_along_edge,
     is_firm,
     seen_frames,
@@ -124,6 +129,7 @@ class TrackObjects:
             in_view = hand < joints.shape[1] and len(seen_frames(joints[:, hand]))
             if not in_view:
                 held[hand] = number
+        held = {**_closed_on(action, with_objects(state, new), found, self), **held}
         return replace(
             so_far,
             new_objects=new,
@@ -182,6 +188,29 @@ def estimate_object_motion(
                 if number not in found or change < found[number][0]:
                     found[number] = change, hand, motion
     return {hand: motion for _, hand, motion in found.values()}, new, notes
+
+
+def _closed_on(
+    action: Action, state: SceneState, found: Mapping[int, ObjectMotion], config: TrackObjects
+) -> dict[int, int]:
+    """Return the object that each hand closes on until the clip ends: it has not held it yet."""
+    motions = {motion.model.number: motion.path[-1] for motion in found.values()}
+    held = {}
+    for hand in range(action.joints_m.shape[1]):
+        joints = action.joints_m[:, hand]
+        seen = seen_frames(joints)
+        if not len(seen) or seen[-1] != len(joints) - 1:
+            continue
+        tips = complete_hand(joints, seen)[:, TIPS[action.kind]]
+        if not closes_to_end(tips, config.opening_tolerance_m):
+            continue
+        for number in _near_tips(tips, state, config):
+            model = object_model(number, state, config, action.cameras.world_from_camera[0])
+            end = transform(motions.get(number, np.eye(4)), model.points_m)
+            faces = hull_on_plane(end, model.plane)
+            if faces is not None and encloses(faces, tips[-1]):
+                held[hand] = number
+    return held
 
 
 def _best_candidate(

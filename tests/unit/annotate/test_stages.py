@@ -99,10 +99,17 @@ def test_moved_objects_get_ids_and_sleeves_are_arms(tmp_path, monkeypatch):
     shown[1, :, 30:40, 30:40] = True
     shown[2, :, 40:48, 0:20] = True
     found = [
-        Moved(first=mask[0], shown=mask, motion_px=np.zeros((9, 2, 3)), contacts=(), worn=n == 2)
+        Moved(
+            first=mask[0],
+            start=np.zeros((0, 2), np.float32),
+            shown=mask,
+            motion_px=np.zeros((9, 2, 3)),
+            contacts=(),
+            worn=n == 2,
+        )
         for n, mask in enumerate(shown)
     ]
-    monkeypatch.setattr("egosim_jax.perception.moved.find_moved", lambda *_: found)
+    monkeypatch.setattr("egosim_jax.perception.moved.find_moved", lambda *_, **__: found)
     settings = config()
     record = find_moved_objects(record, settings.build(), settings)
     ids = record.require("object_ids")

@@ -52,10 +52,10 @@ def scene(*clusters):
 
 
 def closed_on(thumb, fingers):
-    """Return a grip from the first to the last of three frames, with the fingertips at places."""
+    """Return a grip from the second to the last of three frames, with the fingertips at places."""
     tips = np.repeat(np.array([[thumb, fingers]], float), 3, axis=0)
     return Grip(
-        palm_m=tips, tips_m=tips, holds=[(0, 2)], sure=True, radius_m=0.012, eyes_m=np.zeros((3, 3))
+        palm_m=tips, tips_m=tips, holds=[(1, 2)], sure=True, radius_m=0.012, eyes_m=np.zeros((3, 3))
     )
 
 

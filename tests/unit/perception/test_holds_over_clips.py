@@ -7,6 +7,7 @@ import pytest
 
 from egosim_jax.geometry import invert, transform
 from egosim_jax.perception.classical import ClassicalConfig
+from egosim_jax.simulation.actions import slice_action
 from egosim_jax.state.fuse import fuse
 from egosim_jax.state.snapshot import load, save
 from egosim_jax.types import Clip, VideoSpec
@@ -16,6 +17,7 @@ SPEC = VideoSpec(frames=49, height=96, width=160, fps=8)
 PARTS = (slice(0, 17), slice(16, 33), slice(32, 49))
 """Three clips of one hold: the hand closes in the first and opens in the last."""
 CLOSER_M = 0.012
+UP_M = np.array([0, 0, 0.1])
 
 
 def step(clip, frames, state, **changes):
@@ -71,3 +73,27 @@ def test_a_hand_out_of_view_still_holds():
     action = replace(to_action(clip), cameras=cameras, joints_m=away)
     after = fuse(state, ClassicalConfig().build()(seen, action, state))
     assert after.held == state.held == {0: clip.body_ids[clip.target]}
+
+
+@pytest.mark.parametrize(("kind", "seed"), [("human", 1), ("robot", 3)])
+def test_a_hand_that_closes_to_the_end_of_a_clip_holds_in_the_next(kind, seed):
+    """A policy that gives one row a clip. The frames leave the object where it was."""
+    clip = next(make_sequence(seed, spec=SPEC, kind=kind))
+    target, joints = clip.body_ids[clip.target], clip.joints_m
+    tips = joints[:, 0][:, [4, 8, 12] if kind == "human" else [1, 2]]
+    opening = np.linalg.norm(tips[:, 0] - tips[:, 1:].mean(axis=1), axis=-1)
+    last = int(np.argmax(opening <= opening.min() + 1e-3))
+    closed, opened = joints[last], joints[int(np.argmax(opening[: last + 1]))]
+    opened = opened + (closed - opened)[:, :1]
+    share = np.linspace(0, 1, 17)[:, None, None, None]
+    state = clip.state
+    for hands, rise_m in ((opened + share * (closed - opened), 0), (closed + share * UP_M, 0.1)):
+        action = slice_action(to_action(clip), 0, 17)
+        poses = np.repeat(action.cameras.world_from_camera[:1], 17, axis=0)
+        cameras = replace(action.cameras, world_from_camera=poses)
+        action = replace(action, cameras=cameras, joints_m=hands)
+        still = Clip(frames=np.repeat(clip.first.colors[None], 17, axis=0), fps=SPEC.fps)
+        state = fuse(state, ClassicalConfig().build()(still, action, state))
+        moved = points(state, clip).mean(axis=0) - points(clip.state, clip).mean(axis=0)
+        np.testing.assert_allclose(moved, [0, 0, rise_m], atol=0.01)
+        assert state.held == {0: target}

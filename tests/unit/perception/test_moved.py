@@ -40,14 +40,14 @@ def painted(steps, *, hand=True):
     return frames, shown, tracks
 
 
-def find(frames, tracks):
+def find(frames, tracks, fps=8.0):
     hidden = np.zeros(frames.shape[:3], bool)
     for frame, side in np.argwhere(tracks.presence > 0):
         for x, y in np.rint(tracks.joints_px[frame, side]).astype(int):
             hidden[frame] |= np.hypot(*np.mgrid[-y : HEIGHT - y, -x : WIDTH - x]) < 4
     frames = np.where(hidden[..., None], np.uint8(90), frames)
     depth = np.full((HEIGHT, WIDTH), 1.0)
-    return find_moved(frames, hidden, tracks, still_cameras(), depth), hidden
+    return find_moved(frames, hidden, tracks, still_cameras(), depth, fps=fps), hidden
 
 
 def carried():
@@ -72,6 +72,15 @@ def test_a_carried_box_is_found_and_followed(found):
     corner = box.motion_px[-1] @ [75, 75, 1] - [75, 75]
     np.testing.assert_allclose(corner, carried()[-1], atol=1)
     assert not box.worn
+
+
+def test_at_a_high_frame_rate_motion_is_interpolated_between_the_frames_that_are_searched():
+    frames, shown, tracks = painted(carried())
+    (box,), hidden = find(frames, tracks, fps=20.0)
+    assert overlap(box.first, shown[0] & ~hidden[0]) > 0.8
+    assert box.shown.shape == shown.shape
+    assert all(overlap(box.shown[n], shown[n]) > 0.6 for n in (0, FRAMES // 2, FRAMES - 1))
+    assert {frame for frame, _ in box.contacts} <= set(range(FRAMES))
 
 
 def test_a_box_that_moves_without_a_hand_is_not_found():
