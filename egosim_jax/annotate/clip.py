@@ -37,6 +37,7 @@ from egosim_jax.io.bounded import read_json
 from egosim_jax.io.journal import Journal
 from egosim_jax.io.run import write_json, write_text
 from egosim_jax.runtime.command import system_failure
+from egosim_jax.runtime.phases import phase
 from egosim_jax.state import snapshot
 from egosim_jax.types import InputError
 
@@ -83,7 +84,8 @@ def annotate(
         record = _run_stages(job, out, config, estimators, notes, first_only=first_only)
         if record is None:
             return "started"
-        _write(job, out, config, record, notes)
+        with phase(f"{job.video_id}: writes the clip", only_if_long=True):
+            _write(job, out, config, record, notes)
         status = "done"
     except RefusedError as refused:
         status = "refused"
@@ -180,12 +182,13 @@ def _run_stages(
     for stage in chosen:
         cv2.setRNGSeed(config.seed % 2**31)  # per stage: a resumed clip gets the same results
         then = time.monotonic()
-        if stage.stored:
-            record = _stored(journal, folder, stage, record, estimators, config)
-            times[stage.name] = journal.done[stage.name]["seconds"]
-        else:
-            record = stage.run(record, estimators, config)
-            times[stage.name] = round(time.monotonic() - then, 3)
+        with phase(f"{job.video_id}: {stage.name}", only_if_long=True):
+            if stage.stored:
+                record = _stored(journal, folder, stage, record, estimators, config)
+                times[stage.name] = journal.done[stage.name]["seconds"]
+            else:
+                record = stage.run(record, estimators, config)
+                times[stage.name] = round(time.monotonic() - then, 3)
         notes |= record.notes
     return None if first_only else record
 

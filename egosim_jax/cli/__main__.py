@@ -28,6 +28,7 @@ egosim: an egocentric world simulator in JAX
   egosim serve                               a world for policies to step, over websocket or HTTP
   egosim models list                         models, and where their weights are
   egosim train debug --out DIR               train for minutes; egosim train --help lists all
+  egosim convert --help                      PyTorch weights to JAX, and back
   egosim doctor                              devices, versions, extras and weights
 
 egosim --help describes all commands, egosim COMMAND --help one with its options."""
