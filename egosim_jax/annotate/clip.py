@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from egosim_jax.annotate import record as records
 from egosim_jax.annotate.config import AnnotateConfig, Estimators
@@ -33,9 +34,10 @@ from egosim_jax.data.clips import write_clip
 from egosim_jax.data.recording import Recording
 from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.io.atomic import atomic_write
-from egosim_jax.io.bounded import read_json
+from egosim_jax.io.bounded import quote_path, read_json
 from egosim_jax.io.journal import Journal
 from egosim_jax.io.run import write_json, write_text
+from egosim_jax.io.untrusted.npz import MAX_PACKED_BYTES, read_arrays
 from egosim_jax.runtime.command import system_failure
 from egosim_jax.runtime.phases import phase
 from egosim_jax.state import snapshot
@@ -214,6 +216,26 @@ def _load(path: Path, *, record: Record, stage: Stage) -> Record:
     return records.load(path, record, stage.stored, stage.name)
 
 
+def write_masks(path: Path, hands: Bool[np.ndarray, "f h w"]) -> None:
+    """Write the pixels of hands, eight in a byte: compressed if they are read so."""
+    bits = np.packbits(hands, axis=2)
+    write = np.savez_compressed if bits.nbytes < MAX_PACKED_BYTES else np.savez
+    with atomic_write(path) as temporary:
+        write(temporary, hands=bits)
+
+
+def read_masks(path: Path, shape: tuple[int, int, int]) -> Bool[np.ndarray, "f h w"]:
+    """Read the pixels of hands in frames of this shape. Raises `InputError` if they differ."""
+    bits = read_arrays(path, {"hands": "uint8"}, packed=True)["hands"]
+    frames, height, width = shape
+    if bits.shape != (frames, height, -(-width // 8)):
+        raise InputError(
+            f"{quote_path(path)} has masks of {bits.shape} bytes, the video {shape} pixels, eight "
+            "to a byte: they must agree. Annotate the clip again."
+        )
+    return np.unpackbits(bits, axis=2, count=width).astype(bool)
+
+
 def _write(
     job: Job, out: Path, config: AnnotateConfig, record: Record, notes: dict[str, Any]
 ) -> None:
@@ -232,8 +254,7 @@ def _write(
         )
     with atomic_write(folder / "depth.npz") as temporary:
         np.savez(temporary, depth_m=record.require("depth").depth_m[0])
-    with atomic_write(folder / MASKS) as temporary:
-        np.savez_compressed(temporary, hands=record.moving)
+    write_masks(folder / MASKS, record.moving)
     snapshot.save(folder / "state", record.require("state"))
     mask = np.repeat(triplet.mask[..., None], 3, axis=-1)
     videos = {

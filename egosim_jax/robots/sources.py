@@ -19,7 +19,7 @@ from typing import Any, no_type_check
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from egosim_jax.annotate.clip import ANNOTATION, MASKS
+from egosim_jax.annotate.clip import ANNOTATION, MASKS, read_masks
 from egosim_jax.annotate.to_episode import episode_from
 from egosim_jax.geometry import invert
 from egosim_jax.interactive.server.session import CLOSED, SETTINGS
@@ -27,7 +27,6 @@ from egosim_jax.io.bounded import quote_path, quote_text, read_json
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.journal import NAME, Journal
 from egosim_jax.io.run import CONFIG
-from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.io.video import probe_video
 from egosim_jax.perception import archive
 from egosim_jax.perception.classical import ClassicalConfig, take_action
@@ -115,13 +114,8 @@ def _annotated(path: Path) -> Source:
         frames=info.frames, height=info.height, width=info.width, fps=max(1, round(info.fps))
     )
     episode = episode_from(path, video, clips=1)
-    masks = read_arrays(path / MASKS, {"hands": "bool"}, packed=True)["hands"]
     frames = episode.ground_truth[0].frames
-    if masks.shape != frames.shape[:3]:
-        raise InputError(
-            f"{quote_path(path / MASKS)} has masks of {masks.shape}, the video {frames.shape[:3]}: "
-            "they must agree. Annotate the clip again."
-        )
+    masks = read_masks(path / MASKS, frames.shape[:3])
     config = ClassicalConfig()
     stages = (take_action, _KnownHands(masks), config.motion, config.moved, config.new)
     return _perceived(

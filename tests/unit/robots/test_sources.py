@@ -8,9 +8,8 @@ import pytest
 
 pytest.importorskip("mink")
 
-from egosim_jax.annotate.clip import ANNOTATION, MASKS
+from egosim_jax.annotate.clip import ANNOTATION, MASKS, read_masks, write_masks
 from egosim_jax.interactive.server.store import Limits, Store
-from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.io.video import write_video
 from egosim_jax.robots.conversion import convert
 from egosim_jax.robots.sources import open_source
@@ -42,12 +41,22 @@ def test_an_annotated_clip_has_its_masks_and_what_perception_finds(tmp_path):
     annotate([video], tmp_path / "out", settings)
     source = open_source(tmp_path / "out/cup")
     (truth,) = source.episode.ground_truth
-    masks = read_arrays(tmp_path / "out/cup" / MASKS, {"hands": "bool"}, packed=True)["hands"]
+    masks = read_masks(tmp_path / "out/cup" / MASKS, (9, 48, 80))
     assert masks.any()
     assert np.array_equal(truth.object_ids < 0, masks)
     assert (source.kind, source.episode.shape, source.episode.fps) == (
         "annotated clip", (9, 48, 80), 16,
     )  # fmt: skip
+
+
+def test_masks_of_a_long_clip_are_read(tmp_path):
+    """300 frames of 832x464: a byte for each pixel would be refused as too large."""
+    hands = np.zeros((300, 464, 830), bool)
+    hands[5, 100:200, 7:300] = True
+    write_masks(tmp_path / MASKS, hands)
+    np.testing.assert_array_equal(read_masks(tmp_path / MASKS, hands.shape), hands)
+    with pytest.raises(InputError, match="Annotate the clip again"):
+        read_masks(tmp_path / MASKS, (300, 464, 840))
 
 
 def test_a_refused_clip_says_why_it_has_no_cameras(tmp_path):
