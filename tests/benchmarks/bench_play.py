@@ -89,7 +89,7 @@ def write_gif(path, before, after, boxes, frames):
     small = [
         shot.crop((left, 0, width, height)).resize(size, Image.Resampling.LANCZOS) for shot in shots
     ]
-    palette = small[len(small) // 2].quantize(160)
+    palette = small[len(small) // 2].quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=3)
     images = [shot.quantize(palette=palette, dither=Image.Dither.NONE) for shot in small]
     durations = [800, *[125] * (len(images) - 2), 2500]
     images[0].save(
