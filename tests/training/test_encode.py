@@ -326,8 +326,8 @@ def test_shards_that_do_not_name_the_packing_of_their_mask_are_refused(tmp_path)
 
 
 def test_one_of_two_processes_is_killed_and_one_process_goes_on(weights, tmp_path):
-    """Killed when its first part exists, while the other waits for it or still encodes."""
-    clips = write_clips(tmp_path / "clips", DEBUG.video, count=6, frames=13)
+    """Killed when its first part of several exists, while both still encode."""
+    clips = write_clips(tmp_path / "clips", DEBUG.video, count=24, frames=13)
     fixed = ["--config", "debug", "--weights", str(weights), "--shards", str(clips)]
 
     def arguments(out: Path) -> list[str]:
