@@ -145,6 +145,11 @@ def complete_hand(
     return np.stack(complete, axis=1).reshape(joints_m.shape)
 
 
+def opening_of(tips_m: Float[np.ndarray, "f j 3"]) -> Float[np.ndarray, " f"]:
+    """Return the distance between thumb and fingers in each frame, in meters."""
+    return np.linalg.norm(tips_m[:, 0] - tips_m[:, 1:].mean(axis=1), axis=-1)
+
+
 def find_holds(
     tips_m: Float[np.ndarray, "f j 3"], tolerance_m: float, *, holding: bool = False
 ) -> tuple[list[tuple[int, int]], bool]:
@@ -157,7 +162,7 @@ def find_holds(
     frames of a long clip. A hand that is `holding` something in the first frame, and whose opening
     is always steady, holds it in all frames.
     """
-    opening = np.linalg.norm(tips_m[:, 0] - tips_m[:, 1:].mean(axis=1), axis=-1)
+    opening = opening_of(tips_m)
     pairs = [(g, r) for g, r in combinations(range(len(tips_m)), 2) if r - g >= MIN_HELD]
     bends = np.abs(np.diff(opening, 2))
     noise = np.percentile(bends, 25) if len(bends) >= MIN_BENDS else 0.0
@@ -276,7 +281,7 @@ def _outside(
 
 def closes_to_end(tips_m: Float[np.ndarray, "f j 3"], tolerance_m: float) -> bool:
     """Return True if a hand closes, by more than a tolerance, until the last frame."""
-    opening = np.linalg.norm(tips_m[:, 0] - tips_m[:, 1:].mean(axis=1), axis=-1)
+    opening = opening_of(tips_m)
     return bool(opening[-1] <= opening.min() and opening[-1] < opening.max() - tolerance_m)
 
 

@@ -290,8 +290,7 @@ def _best_motions(
         gripped = grip.has(model.points_m, hold[0])
         max_change = config.grip_evidence if gripped else -improvement
         carried = hold[0] == 0 and grip.carried == model.number
-        firm = faces is not None and is_firm(faces, grip.tips_m, hold)
-        if gripped and (carried or firm):
+        if gripped and (carried or (faces is not None and is_firm(faces, grip.tips_m, hold))):
             max_change = config.firm_evidence
         loose = couplings(grip.palm_m, grip.rigid[hold[0]], model.plane[:3], hold)
         hinge = grip.hinges[hold]

@@ -20,11 +20,11 @@ CLOSER_M = 0.012
 UP_M = np.array([0, 0, 0.1])
 
 
-def step(clip, frames, state, **changes):
-    """Perceive a part of a clip, and return the state after it."""
-    action = to_action(clip)
-    cameras = replace(action.cameras, world_from_camera=action.cameras.world_from_camera[frames])
-    action = replace(action, cameras=cameras, joints_m=action.joints_m[frames], **changes)
+def step(clip, frames, state, *, hands=True):
+    """Perceive a part of a clip, with or without its hands, and return the state after it."""
+    action = slice_action(to_action(clip), frames.start, frames.stop)
+    if not hands:
+        action = replace(action, joints_m=np.full_like(action.joints_m, np.nan))
     seen = Clip(frames=clip.frames[frames], fps=SPEC.fps)
     return fuse(state, ClassicalConfig().build()(seen, action, state))
 
@@ -66,12 +66,7 @@ def test_a_steady_hand_moves_nothing_that_the_state_does_not_know_in_it():
 def test_a_hand_out_of_view_still_holds():
     clip = next(make_sequence(4, spec=SPEC))
     state = step(clip, PARTS[0], clip.state)
-    away = np.full_like(to_action(clip).joints_m[PARTS[1]], np.nan)
-    cameras = to_action(clip).cameras
-    cameras = replace(cameras, world_from_camera=cameras.world_from_camera[PARTS[1]])
-    seen = Clip(frames=clip.frames[PARTS[1]], fps=SPEC.fps)
-    action = replace(to_action(clip), cameras=cameras, joints_m=away)
-    after = fuse(state, ClassicalConfig().build()(seen, action, state))
+    after = step(clip, PARTS[1], state, hands=False)
     assert after.held == state.held == {0: clip.body_ids[clip.target]}
 
 
