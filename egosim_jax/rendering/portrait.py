@@ -12,7 +12,7 @@ from PIL import Image
 from egosim_jax.geometry import UP_AXES, Up, look_at
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.rendering.reference import render
-from egosim_jax.runtime.open3d import load_open3d
+from egosim_jax.runtime.open3d import point_cloud
 from egosim_jax.types import Cameras, SceneState
 
 SIDES, ABOVE = (-40.0, 0.0, 40.0), 30.0
@@ -41,8 +41,6 @@ def portrait(state: SceneState, *, up: Up) -> UInt8[np.ndarray, "3 480 640 3"]:
     The front view looks the way a wearer does: along y if z is up, along z if -y is up. The point
     size is the distance between neighboring points, up to `MAX_POINT_PX`.
     """
-    o3d = load_open3d()
-
     upward = np.array(UP_AXES[up])
     forward = np.array({"z": (0.0, 1.0, 0.0), "-y": (0.0, 0.0, 1.0)}[up])
     rightward = np.cross(forward, upward)
@@ -60,7 +58,7 @@ def portrait(state: SceneState, *, up: Up) -> UInt8[np.ndarray, "3 480 640 3"]:
         eye = middle + distance * (np.sin(above) * upward - np.cos(above) * level)
         poses.append(look_at(eye, middle, up=upward))
     focal = WIDTH / 2 / np.tan(np.radians(FIELD_OF_VIEW / 2))
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(state.points_m))
+    cloud = point_cloud(state.points_m)
     spacing = float(np.median(cloud.compute_nearest_neighbor_distance()))
     cameras = Cameras(
         world_from_camera=np.array(poses),

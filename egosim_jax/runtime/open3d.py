@@ -15,6 +15,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 PYBIND = "open3d.cpu.pybind"
 """Name of the native module; `import open3d` finds and uses a loaded one."""
 _LOCK = threading.Lock()
@@ -34,6 +37,12 @@ def load_open3d() -> Any:
         import open3d
 
         return open3d
+
+
+def point_cloud(points_m: Float[np.ndarray, "n 3"]) -> Any:
+    """Return Open3D's cloud of points; it copies float64 as a block, and other types row by row."""
+    o3d = load_open3d()
+    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_m.astype(np.float64)))
 
 
 def _native_spec() -> ModuleSpec | None:

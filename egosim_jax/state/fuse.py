@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from egosim_jax.geometry import cameras_in_object_frame, invert, pixels_of, transform
-from egosim_jax.runtime.open3d import load_open3d
+from egosim_jax.runtime.open3d import load_open3d, point_cloud
 from egosim_jax.state.filter import disappeared_objects
 from egosim_jax.state.new_objects import with_objects
 from egosim_jax.state.tsdf import Fusion, surface, valid_depth_mask
@@ -186,11 +186,9 @@ def _surface_behind(
 
 
 def _remove_outliers(new: _Points) -> _Points:
-    o3d = load_open3d()
-
     if len(new.points_m) <= OUTLIER_NEIGHBORS:
         return new
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(new.points_m))
+    cloud = point_cloud(new.points_m)
     _, kept = cloud.remove_statistical_outlier(OUTLIER_NEIGHBORS, OUTLIER_DEVIATIONS)
     return new[np.array(kept, int)]
 
@@ -199,12 +197,10 @@ def _has_neighbor(
     points_m: Float32[np.ndarray, "n 3"], others_m: Float32[np.ndarray, "m 3"], radius_m: float
 ) -> Bool[np.ndarray, " n"]:
     """Return which points have a neighbor among the others, within a radius in meters."""
-    o3d = load_open3d()
-
     if not len(points_m) or not len(others_m):
         return np.zeros(len(points_m), bool)
-    clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p)) for p in (points_m, others_m)]
-    return np.asarray(clouds[0].compute_point_cloud_distance(clouds[1])) <= radius_m
+    distances = point_cloud(points_m).compute_point_cloud_distance(point_cloud(others_m))
+    return np.asarray(distances) <= radius_m
 
 
 def transfer_colors(new: _Points, old: _Points) -> UInt8[np.ndarray, "n 3"]:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
 from egosim_jax.geometry import pixel_rays
-from egosim_jax.runtime.open3d import load_open3d
+from egosim_jax.runtime.open3d import point_cloud
 from egosim_jax.state.depth import known_depth
 from egosim_jax.state.planes import SupportPlane, area_of, fit_plane, support_planes
 from egosim_jax.state.regions import RegionConfig, find_regions
@@ -286,8 +286,6 @@ def _refine(
 
 def object_sizes(state: SceneState) -> dict[int, Float[np.ndarray, " 3"]]:
     """Return the extents of each object's points along its own axes in meters, ascending."""
-    o3d = load_open3d()
-
     sizes = {}
     for number in np.unique(state.object_ids[state.object_ids > 0]).tolist():
         points = state.points_m[state.object_ids == number].astype(float)
@@ -295,6 +293,6 @@ def object_sizes(state: SceneState) -> dict[int, Float[np.ndarray, " 3"]]:
         if len(points) < 4 or spread[2] < 1e-9 * max(spread[0], 1e-9):
             sizes[number] = np.sort(np.ptp(points, axis=0))
             continue
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+        cloud = point_cloud(points)
         sizes[number] = np.sort(cloud.get_minimal_oriented_bounding_box(robust=True).extent)
     return sizes

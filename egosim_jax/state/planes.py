@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from egosim_jax.runtime.open3d import load_open3d
+from egosim_jax.runtime.open3d import load_open3d, point_cloud
 
 ITERATIONS = 500
 """Number of RANSAC trials per plane."""
@@ -56,7 +56,7 @@ def fit_plane(
     from threadpoolctl import threadpool_limits
 
     o3d.utility.random.seed(0)
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_m))
+    cloud = point_cloud(points_m)
     with threadpool_limits(1, user_api="openmp"):  # its threads race, and runs would differ
         plane, inliers = cloud.segment_plane(tolerance_m, 3, ITERATIONS)
     return np.array(plane), np.array(inliers, int)

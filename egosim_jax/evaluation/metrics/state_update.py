@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from egosim_jax.runtime.open3d import load_open3d
+from egosim_jax.runtime.open3d import load_open3d, point_cloud
 
 ON_SURFACE_M = 0.01
 """Maximum distance in meters of a point on a surface."""
@@ -85,12 +85,10 @@ def nearest(
     points_m: Float[np.ndarray, "n 3"], others_m: Float[np.ndarray, "m 3"]
 ) -> Float[np.ndarray, " n"]:
     """Return the distance of each point to the nearest of the others; infinite without others."""
-    o3d = load_open3d()
-
     if not len(points_m) or not len(others_m):
         return np.full(len(points_m), np.inf)
-    clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p)) for p in (points_m, others_m)]
-    return np.asarray(clouds[0].compute_point_cloud_distance(clouds[1]))
+    distances = point_cloud(points_m).compute_point_cloud_distance(point_cloud(others_m))
+    return np.asarray(distances)
 
 
 def _percent(good: np.ndarray) -> float:
