@@ -74,7 +74,15 @@ class Doctor:
         broken = list(_broken())
         for line in broken:
             console.print(line)
-        _print_models(console, self._folders())
+        _print_models(console)
+        found = [row for folder in self._folders() for row in _rows(folder)]
+        _print_weights(console, found)
+        names = ", ".join(sorted({config for _, config, *_ in found})) or "no model"
+        console.print(
+            "Not ready: repair the modules above."
+            if broken
+            else f"Ready: all required modules work, and there are weights of {names}."
+        )
         return ExitCode.FAILED if broken else ExitCode.DONE
 
     def _folders(self) -> list[Path]:
@@ -120,7 +128,7 @@ def _broken() -> Iterator[str]:
             )
 
 
-def _print_models(console: Console, folders: list[Path]) -> None:
+def _print_models(console: Console) -> None:
     from rich.table import Table
 
     from egosim_jax import configs
@@ -132,11 +140,15 @@ def _print_models(console: Console, folders: list[Path]) -> None:
         clip = f"{video.frames} frames, {video.width}x{video.height}"
         table.add_row(name, clip, f"{_bytes(config) / 1e9:.2f} GB")
     console.print(table)
-    found = Table("folder", "config", "network", "GB", "hash", title="weights found")
-    for folder in folders:
-        for row in _rows(folder):
-            found.add_row(*row)
-    console.print(found if found.row_count else "no weights found")
+
+
+def _print_weights(console: Console, found: list[tuple[str, ...]]) -> None:
+    from rich.table import Table
+
+    table = Table("folder", "config", "network", "GB", "hash", title="weights found")
+    for row in found:
+        table.add_row(*row)
+    console.print(table if found else "no weights found")
 
 
 def _bytes(config: ModelConfig) -> int:

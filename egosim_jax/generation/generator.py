@@ -248,8 +248,9 @@ class Generator:
         """Compile all functions of `generate`, or of `groups`, for batches of this size."""
         count = self.count_programs(streamed=streamed)
         programs = self.programs(batch, streamed=streamed)
+        together = f" for {batch} clips at once" if batch > 1 else ""
         for number, (name, program, inputs) in enumerate(programs, start=1):
-            program.compile(*inputs, about=f"{number} of {count}: {name}")
+            program.compile(*inputs, about=f"{number} of {count}: {name}{together}")
 
     def count_programs(self, *, streamed: bool = False) -> int:
         """Return the number of `programs`, without tracing any."""

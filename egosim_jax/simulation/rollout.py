@@ -42,9 +42,10 @@ OUTPUTS = ("clip_*/*",)
 class Rollout:
     """A simulation in a folder, which can be interrupted and resumed."""
 
-    def __init__(self, simulator: Simulator, folder: Path | str):
+    def __init__(self, simulator: Simulator, folder: Path | str, *, name: str = "clip {number}"):
         self.simulator = simulator
         self.folder = Path(folder)
+        self._name = name  # of a clip, in the lines that say what happens
 
     def run(
         self,
@@ -103,11 +104,12 @@ class Rollout:
         simulator, folder = self.simulator, self.folder / f"clip_{number}"
         timer, by_chunk = FrameTimer(simulator.show), simulator.update_every == "chunk"
         timed, made = replace(simulator, show=timer), list[Step]()
-        with phase(f"clip {number}: renders the view", only_if_long=True):
+        name = self._name.format(number=number)
+        with phase(f"{name}: renders the view", only_if_long=True):
             view = simulator.render(state, action)  # not journaled: it follows from its inputs
 
         def make() -> Clip:
-            with phase(f"clip {number}: generates"):
+            with phase(f"{name}: generates"):
                 if not by_chunk:
                     return timed.generate(view, action, seed=seed, first_frame=first_frame)
                 made.append(timed.step(state, action, seed=seed, first_frame=first_frame))
@@ -133,7 +135,7 @@ class Rollout:
         else:
 
             def perceive() -> Perceived:
-                with phase(f"clip {number}: perceives"):
+                with phase(f"{name}: perceives"):
                     return perception(clip, action, state)
 
             perceived = journal.phase(
@@ -146,7 +148,7 @@ class Rollout:
             notes = perceived.notes
 
             def make_state() -> SceneState:
-                with phase(f"clip {number}: updates the state", only_if_long=True):
+                with phase(f"{name}: updates the state", only_if_long=True):
                     return fuse(state, perceived, fusion=simulator.fusion)
 
         after = journal.phase(

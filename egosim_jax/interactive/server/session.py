@@ -317,7 +317,8 @@ class Session:
             made = RecordedClip(generator=generator, frames=frames)
             simulator = replace(simulator, generator=made)
         with announced(generator) if frames is None else nullcontext():
-            (step,) = Rollout(simulator, folder / "rollout").run(
+            name = f"session {self.id}, step {number}"
+            (step,) = Rollout(simulator, folder / "rollout", name=name).run(
                 now.state, [action], seed=now.seed + now.steps, first_frame=now.first_frame
             )
         request = self._request(number)

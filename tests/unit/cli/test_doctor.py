@@ -26,3 +26,14 @@ def test_fetched_weights_are_listed_and_files_are_not(tmp_path, monkeypatch):
     assert Doctor()._folders()[-1] == Path("weights/mine")
     (fetched / hub.RECORD).write_text("{}")
     assert Doctor()._folders()[-2:] == [Path("weights/mine"), fetched]
+
+
+def test_the_last_line_says_whether_this_machine_is_ready(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert Doctor().run() == 0
+    last = " ".join(capsys.readouterr().out.split("\n")[-2:])
+    assert last.startswith("Ready: ")
+    assert "weights of tabletop, tabletop_student" in last
+    monkeypatch.setattr(doctor, "NATIVE", ("cv2", "no_such_module"))
+    assert Doctor().run() == 1
+    assert capsys.readouterr().out.splitlines()[-1] == "Not ready: repair the modules above."

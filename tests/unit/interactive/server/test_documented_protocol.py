@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from egosim_jax.interactive.env import load_backend
 from egosim_jax.interactive.env.chunks import OBSERVATIONS
 from egosim_jax.interactive.server import wire
 from egosim_jax.interactive.server.client import Client
@@ -15,6 +16,7 @@ from tests.unit.interactive.server.served import http, run
 
 ROOT = Path(__file__).parents[4]
 TEXT = (ROOT / "docs" / "protocol.md").read_text("utf-8")
+SCRIPTS = re.findall(r"```python\n(.*?)```", TEXT, re.S)
 TYPES = {
     "text": str,
     "int": int,
@@ -72,13 +74,21 @@ def port(tmp_path_factory):
 
 
 def test_the_client_needs_no_package_of_ours(port, capsys):
-    (script,) = re.findall(r"```python\n(.*?)```", TEXT, re.S)
+    script, _ = SCRIPTS
     assert len(script.splitlines()) <= 25
     imported = set(re.findall(r"^(?:import|from) (\w+)", script, re.M))
     assert imported == {"msgpack", "websockets"}
     exec(compile(script.replace("8000", str(port)), "protocol.md", "exec"), {})  # noqa: S102
     shape = (VIDEO.frames, VIDEO.height, VIDEO.width, 3)
     assert capsys.readouterr().out == f"painted\n{shape}\n"
+
+
+def test_the_client_lifts_an_object_of_the_true_world(tmp_path, capsys):
+    definitions, script = SCRIPTS[0].split("\n\n\nwith ")[0], SCRIPTS[1]
+    service, port, _ = run(tmp_path, world=load_backend("true"))
+    exec(compile(f"{definitions}\n{script.replace('8000', str(port))}", "protocol.md", "exec"), {})  # noqa: S102
+    service.store.close()
+    assert capsys.readouterr().out == "rises by 0.09 m\n"
 
 
 def test_the_requests_have_the_documented_fields():
