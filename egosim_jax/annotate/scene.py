@@ -298,7 +298,7 @@ def plain_caption(record: Record, names: list[str]) -> str:
     who = (
         "The wearer's two hands move" if len(sides) == 2 else f"The wearer's {sides[0]} hand moves"
     )
-    return f"{who} in view of a head-mounted camera{what}."
+    return f"{who} in view of a camera{what}."
 
 
 def to_triplet(record: Record, config: AnnotateConfig) -> tuple[Triplet, dict[str, Any]]:

@@ -347,12 +347,20 @@ def _save(episode: episodes.Episode, out: Path, *, describe: bool = False) -> in
 
 def summary(episode: episodes.Episode) -> str:
     """Return a one-line description of an episode."""
+    import numpy as np
+
     frames, height, width = episode.shape
     known = "with" if episode.ground_truth else "without"
+    handless = [
+        f"clip {number}"
+        for number, action in enumerate(episode.actions, start=1)
+        if np.isnan(action.joints_m).any(axis=(2, 3)).all()
+    ]
+    where = f" (none in {', '.join(handless)})" if handless else ""
     return (
         f"{len(episode.actions)} clips of {frames} frames of {width}x{height} at {episode.fps} "
-        f"fps, {episode.actions[0].kind} hands, {len(episode.state.points_m)} points, {known} "
-        "ground truth"
+        f"fps, {episode.actions[0].kind} hands{where}, {len(episode.state.points_m)} points, "
+        f"{known} ground truth"
     )
 
 

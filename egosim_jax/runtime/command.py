@@ -190,11 +190,14 @@ def _rules(args: Sequence[str]) -> ConstructorRegistry:
     open_types: list[Any] = []
 
     def described(field: StructFieldSpec) -> StructFieldSpec:
-        text = field.helptext
+        text = field.helptext() if callable(field.helptext) else field.helptext
+        if field.default is None and "None" not in (text or ""):  # to be left out, not given
+            shown = tyro.conf.arg(help_behavior_hint="")
+            kind: Any = Annotated[field.type, tyro.conf.DisallowNone, shown]
+            field = replace(field, type=kind)
         if not completing or text is None:
             return field
-        full = text() if callable(text) else text
-        return replace(field, helptext=full and full.strip().partition("\n")[0])
+        return replace(field, helptext=text.strip().partition("\n")[0])
 
     @registry.struct_rule
     def rule(info: StructTypeInfo) -> StructConstructorSpec | None:

@@ -77,9 +77,7 @@ def test_an_annotation_says_what_was_chosen(video, tmp_path):
     assert about["cameras"]["rung"] == "static"
     assert about["cameras"]["figures"] == {"still": 1.0}
     assert about["caption"]["source"] == "rule"
-    assert (
-        about["row"]["prompt"] == "The wearer's right hand moves in view of a head-mounted camera."
-    )
+    assert about["row"]["prompt"] == "The wearer's right hand moves in view of a camera."
     assert about["hands"]["frames"] == {"left": 0, "right": 17}
     assert set(about["seconds"]) >= {"hands", "cameras", "depth", "scale", "plate", "write"}
     page = (out / "index.html").read_text()
