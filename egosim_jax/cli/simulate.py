@@ -365,4 +365,4 @@ def _print(report: Sequence[Mapping[str, Any]]) -> None:
         }
         for line in report
     }
-    print_table("clip", rows, shown)
+    print_table("clip", rows, shown, caption="report.json defines these measures")

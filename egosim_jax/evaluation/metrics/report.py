@@ -99,7 +99,12 @@ def paired_difference(
 
 
 def print_table(
-    corner: str, rows: Mapping[str, Summary], measures: Measures, *, title: str | None = None
+    corner: str,
+    rows: Mapping[str, Summary],
+    measures: Measures,
+    *,
+    title: str | None = None,
+    caption: str | None = None,
 ) -> None:
     """Print a row for each summary as mean ± spread; `corner` is the heading of the row names.
 
@@ -111,7 +116,9 @@ def print_table(
 
     from egosim_jax.runtime.terminal import make_console
 
-    table = Table(corner, *(heading for heading, _ in measures.values()), title=title)
+    table = Table(
+        corner, *(heading for heading, _ in measures.values()), title=title, caption=caption
+    )
     for row, summary in rows.items():
         cells = (cell_of(summary.get(name, {}), form) for name, (_, form) in measures.items())
         table.add_row(row, *cells)

@@ -65,7 +65,7 @@ def test_the_summary_names_clips_without_hands(own):
     shown = read_action(own(joints_m=[[hand], [None]]), **READ)
     hidden = read_action(own(), **READ)
     state = SceneState(
-        points_m=np.ones((2, 3), np.float32),
+        points_m=np.full((2, 3), (0, 0, 1), np.float32),
         colors=np.zeros((2, 3), np.uint8),
         object_ids=np.zeros(2, np.int32),
         last_seen=np.zeros(2, np.int32),
