@@ -170,11 +170,10 @@ class Annotate:
         cameras = [about["cameras"] for about in report["annotations"] if about.get("cameras")]
         assumed = [found for found in cameras if found["focal_source"] == "assumed"]
         if assumed:
-            focal = assumed[0]["focal_px"]
             print(
-                f"{len(assumed)} clips do not show their focal length: {focal:.0f} pixels of the "
-                "clip (a view of 90 degrees) are assumed. Give it, in pixels of the video, if you "
-                "know it. (--focal)",
+                f"{len(assumed)} clips do not show their focal length: a view of 90 degrees is "
+                "assumed, so it is half of the video's longer side. Give it, in pixels of the "
+                "video, if you know it. (--focal)",
                 file=sys.stderr,
             )
         print(

@@ -56,9 +56,7 @@ def test_an_assumed_focal_length_is_said(video, tmp_path, capsys, monkeypatch, o
     out = tmp_path / "out"
     command = ["data", "annotate", str(video), "--out", str(out), *OPTIONS, *options]
     assert main(command) == ExitCode.DONE
-    said = "1 clips do not show their focal length: 80 pixels of the clip" in (
-        capsys.readouterr().err
-    )
+    said = "1 clips do not show their focal length: a view of 90" in capsys.readouterr().err
     source = read_json(out / "cup" / ANNOTATION)["cameras"]["focal_source"]
     assert (said, source) == ((False, "--focal") if options else (True, "assumed"))
 
