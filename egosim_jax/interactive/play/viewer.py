@@ -49,6 +49,8 @@ INTERACTIONS: tuple[tuple[str, Interaction], ...] = (
     ("open or close it", "open or close"),
 )
 """Button labels of the interactions."""
+BACKGROUND = (206, 213, 220)
+"""Color behind the scene, in which white objects and gaps of the state are seen."""
 NOTHING: tuple[str, ...] = ("-",)
 """Placeholder of an empty list."""
 PREVIEW_S = 0.1
@@ -104,6 +106,7 @@ class Page:
     def _make_scene(self) -> None:
         scene = self._server.scene
         scene.set_up_direction("+z")
+        scene.set_background_image(np.full((1, 1, 3), BACKGROUND, np.uint8))
         first = self._server.initial_camera
         first.position, first.look_at, first.fov = (0.5, -0.42, 0.55), (0.0, 0.22, 0.0), 0.9
         self._cloud = scene.add_point_cloud(
@@ -131,13 +134,13 @@ class Page:
 
     def _make_controls(self) -> None:
         gui = self._server.gui
-        gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        gui.configure_theme(
+            control_layout="fixed", control_width="large", show_logo=False, show_share_button=False
+        )
         gui.set_panel_label("egosim play")
-        blank = np.zeros((self.played.world.video.height, self.played.world.video.width, 3))
-        self._images = [
-            gui.add_image(_large(blank.astype(np.uint8)), label=label, jpeg_quality=90)
-            for label in ("Generated", "Ground truth")
-        ]
+        size = self.played.world.video.height, self.played.world.video.width
+        blank = _large(np.zeros((*size, 3), np.uint8))
+        self._images = [gui.add_image(blank, label="Generated", jpeg_quality=90)]
         gui.add_markdown(HELP)
         self._status = gui.add_markdown("")
         with gui.add_folder("Act"):
@@ -163,6 +166,8 @@ class Page:
             self._choose("This episode", times)
             self._seed = gui.add_number("Table", self.played.now.start.seed, min=0, step=1)
             self._choose("That table", {"begin there": self._begin})
+        # Below the controls, which would else be out of sight on a small screen.
+        self._images.append(gui.add_image(blank, label="Ground truth", jpeg_quality=90))
 
     def _choose(self, label: str, runs: dict[str, Callable[[], None]]) -> None:
         """Add a row of buttons; each one changes the episode."""
