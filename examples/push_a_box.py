@@ -38,3 +38,4 @@ for number, keys in enumerate([push, leave]):  # at frames 0, 4 and 16: x, y, z,
     clip = {"world_from_camera": [camera.tolist()] * 17, "intrinsics_px": intrinsics_px.tolist()}
     clip |= {"joints_m": joints, "prompt": prompts[number]}
     (out / f"clip_{number + 1}.json").write_text(json.dumps(clip))
+print(out)
