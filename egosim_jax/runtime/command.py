@@ -6,6 +6,7 @@ import difflib
 import errno
 import logging
 import os
+import re
 import select
 import sys
 import traceback
@@ -195,9 +196,10 @@ def _rules(args: Sequence[str]) -> ConstructorRegistry:
             shown = tyro.conf.arg(help_behavior_hint="")
             kind: Any = Annotated[field.type, tyro.conf.DisallowNone, shown]
             field = replace(field, type=kind)
-        if not completing or text is None:
+        if text is None:
             return field
-        return replace(field, helptext=text.strip().partition("\n")[0])
+        text = re.sub(r"\n\s*\n", "\n", text.strip())  # else tyro leaves two lines empty
+        return replace(field, helptext=text.partition("\n")[0] if completing else text)
 
     @registry.struct_rule
     def rule(info: StructTypeInfo) -> StructConstructorSpec | None:
