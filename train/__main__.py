@@ -40,7 +40,7 @@ def main(args: Sequence[str] | None = None, *, program: str = "egosim-train") ->
         program=program,
         description="Train a model. The same command resumes an interrupted run. With --preflight "
         "it only reports whether the training would fit a machine, which can be absent. `tabletop "
-        "--online` trains while other processes make scenes, with options of its own.",
+        "--online` trains while other processes make scenes, with other options.",
         args=args,
         context=training_context if args is None and not without_training else nullcontext,
     )
