@@ -192,7 +192,7 @@ def _rules(args: Sequence[str]) -> ConstructorRegistry:
 
     def described(field: StructFieldSpec) -> StructFieldSpec:
         text = field.helptext() if callable(field.helptext) else field.helptext
-        if field.default is None and "None" not in (text or ""):  # not an option to write
+        if field.default is None and "None" not in (text or ""):  # never written as None
             shown = tyro.conf.arg(help_behavior_hint="")
             kind: Any = Annotated[field.type, tyro.conf.DisallowNone, shown]
             field = replace(field, type=kind)

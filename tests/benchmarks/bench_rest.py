@@ -1,10 +1,10 @@
-"""What a hand that rests costs: three clips of it against three clips without hands.
+"""Three clips of a hand at rest against three clips without hands.
 
     python -m tests.benchmarks.bench_rest [--scenes 12]
 
 Each scene has a fixed camera and is simulated twice, with the state of `classical`. Printed are the
 PSNR of each clip against the true world, and how far the colors of the objects, which nothing
-touches, drift from the end of the first clip to that of the last: the largest change of a channel's
+touches, drift from the end of the first clip to the end of the last: the largest change of a channel's
 mean over the pixels of an object, in 8-bit levels.
 """
 
