@@ -4,8 +4,8 @@
 
 Each scene has a fixed camera and is simulated twice, with the state of `classical`. Printed are the
 PSNR of each clip against the true world, and how far the colors of the objects, which nothing
-touches, drift from the end of the first clip to the end of the last: the largest change of a channel's
-mean over the pixels of an object, in 8-bit levels.
+touches, drift from the end of the first clip to the end of the last: the largest change of the mean
+of a channel over the pixels of an object, in 8-bit levels.
 """
 
 import numpy as np
