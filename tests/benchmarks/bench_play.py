@@ -35,7 +35,7 @@ WATCH = """(() => {
 """Script that notes when images and the status change in the page."""
 WIDTH = 880
 """Columns of the recording."""
-EMPTY = 0.2
+EMPTY = 0.06
 """Share of the page, on the left, that the scene leaves empty and the recording lacks."""
 DISMISS = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())"
 """Script that closes notifications, such as the one about a browser without a GPU."""
@@ -57,15 +57,14 @@ def record(page, runs, path):
     """Record the page while a clip is made: shots before and after, and its images as played."""
     page.run(DISMISS)
     time.sleep(1)
-    before = page.screenshot()
+    before, boxes = page.screenshot(), page.boxes()
     page.click("put it on the ring")
     page.wait_for_text("state updated after")
-    time.sleep(1)
+    time.sleep(5)  # until it has been played
     after = page.screenshot()
     page.click("save")
     page.wait_for_text("episode.zip")
     (video,) = runs.glob("*/episode.mp4")
-    boxes = page.boxes()
     write_gif(path, before, after, boxes, read_video(video).frames)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
 
@@ -76,13 +75,14 @@ def write_gif(path, before, after, boxes, frames):
     `frames` have the generated and the true image side by side, `boxes` where the page has them.
     """
     shots = [Image.fromarray(before)]
-    for number, frame in enumerate(frames):
-        shot = Image.fromarray(before if number < len(frames) - 1 else after)
+    for frame in frames[:-1]:
+        shot = Image.fromarray(before)
         for image, (x, y, width, height) in zip(np.split(frame, 2, axis=1), boxes, strict=True):
             size = round(width), round(height)
             large = Image.fromarray(image).resize(size, Image.Resampling.BICUBIC)
             shot.paste(large, (round(x), round(y)))
         shots.append(shot)
+    shots.append(Image.fromarray(after))
     height, width = before.shape[:2]
     left = round(EMPTY * width)
     size = WIDTH, round(WIDTH * height / (width - left))
@@ -114,7 +114,7 @@ def measure(config, clips, gif):
     with (
         tempfile.TemporaryDirectory() as name,
         playing(Path(name) / "runs", "--seed", "0", "--config", config) as url,
-        browse(url, Path(name), size=(1180, 1000)) as page,
+        browse(url, Path(name), size=(1180, 1210)) as page,
     ):
         page.wait_for_text("put it on the ring")
         time.sleep(3)
