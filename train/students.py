@@ -16,6 +16,7 @@ from egosim_jax.train.config import CriticConfig, OptimizerConfig, TrainConfig
 from egosim_jax.train.distillation import ConsistencyDistillation, SelfForcing
 from egosim_jax.train.fine_tuning import FineTuning
 from egosim_jax.train.recipe import Recipe
+from egosim_jax.types import MeshConfig
 
 _ADAM = OptimizerConfig(learning_rate=2e-6, b1=0.0, weight_decay=0.01)
 _AR = TrainConfig(
@@ -69,7 +70,8 @@ EGOSIM_14B_DMD = SelfForcing(
     config="egosim_14b",
     chunks=_CHUNKS,
     first_steps=4,
-    training=_DMD,
+    # The keys and values of all chunks stay for the gradient: two devices share a clip.
+    training=replace(_DMD, grad_accum_steps=8, mesh=MeshConfig(context=2)),
     critic=_CRITIC,
     change_loss_weight=_CHANGE,
 )
@@ -79,15 +81,16 @@ r"""Self-forcing of the student of `egosim_14b_student_cd`, with EgoSim-14B as t
         --teacher weights/egosim_14b --latents latents/train --validation latents/test \
         --out runs/student_dmd
 
-120 updates of the student, each after five of the critic. Four denoising steps of the first chunk
+120 updates of the student, each after five of the critic. On 8 x H200, two devices share a clip:
+125.5 of 133.3 GiB (`--preflight h200:8`). Four denoising steps of the first chunk
 and two of the others, whose last keys later chunks see. Stop when LPIPS of held-out clips no longer
 falls (`egosim generate` with the kept checkpoints, `egosim evaluate`). On one H200, three LoRAs
 share one frozen base:
 
     egosim-train egosim_14b_student_dmd --rank 64 --lora runs/student_cd/lora.safetensors \
         --training.optimizer.learning-rate 1e-4 --critic.optimizer.learning-rate 2e-5 \
-        --training.grad-accum-steps 32 --weights weights/egosim_14b --latents latents/train \
-        --out runs/student_dmd
+        --training.grad-accum-steps 32 --training.mesh.context 1 --weights weights/egosim_14b \
+        --latents latents/train --out runs/student_dmd
 
 They take 124.5 GiB, and an update has 1.0e18 model FLOPs (`--preflight h200:1`): 120 updates are 86
 hours at 40 % of the peak. Estimated, not measured.
@@ -99,7 +102,7 @@ EGOSIM_1_3B_AR = replace(EGOSIM_14B_AR, config="egosim_1_3b")
 EGOSIM_1_3B_CD = replace(EGOSIM_14B_CD, config="egosim_1_3b")
 """Consistency distillation of the 1.3B student, as `egosim_14b_student_cd`: one H200."""
 
-EGOSIM_1_3B_DMD = replace(EGOSIM_14B_DMD, config="egosim_1_3b")
+EGOSIM_1_3B_DMD = replace(EGOSIM_14B_DMD, config="egosim_1_3b", training=_DMD)
 """Self-forcing of the 1.3B student, as `egosim_14b_student_dmd`: one H200."""
 
 _SMALL = TrainConfig(

@@ -1,6 +1,6 @@
 """A tiny training run as a program, so that tests can kill it.
 
-DATA OUT STEPS SAVE_EVERY [TASK]
+DATA OUT STEPS SAVE_EVERY [TASK [CONTEXT]]
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from egosim_jax.train.loop import train
 from egosim_jax.train.tasks.consistency import Consistency
 from egosim_jax.train.tasks.denoising import Denoising
 from egosim_jax.train.tasks.matching import Matching
-from egosim_jax.types import VideoSpec
+from egosim_jax.types import MeshConfig, VideoSpec
 
 MODEL = tiny_model()
 DROPOUT = ConditionDropout(prior=0.2, mask=0.2, hands=0.2, text=0.2)
@@ -44,7 +44,7 @@ TASKS = {
 }
 
 
-def training(steps: int, save_every: int) -> TrainConfig:
+def training(steps: int, save_every: int, *, context: int = 1) -> TrainConfig:
     """Return a config with Muon's and AdamW's moments and an EMA, which a resume must restore."""
     return TrainConfig(
         steps=steps,
@@ -59,21 +59,26 @@ def training(steps: int, save_every: int) -> TrainConfig:
         log_every=1,
         save_every=save_every,
         validate_every=1000,
+        mesh=MeshConfig(context=context),
     )
 
 
-def fit(data: Path, out: Path, *, steps: int, save_every: int, task: str) -> None:
+def fit(data: Path, out: Path, *, steps: int, save_every: int, task: str, context: int = 1) -> None:
     """Train, and write the weights."""
-    networks = train(TASKS[task], training(steps, save_every), data=data, validation=None, out=out)
+    config = training(steps, save_every, context=context)
+    networks = train(TASKS[task], config, data=data, validation=None, out=out)
     weights.save(out / "dit.safetensors", networks.dit)
 
 
-def main(data: str, out: str, steps: str, save_every: str, task: str = "egosim") -> int:
+def main(
+    data: str, out: str, steps: str, save_every: str, task: str = "egosim", context: str = "1"
+) -> int:
     """Train as the commands do."""
+    counts = {"steps": int(steps), "save_every": int(save_every), "context": int(context)}
 
     def run() -> int:
         with training_context():
-            fit(Path(data), Path(out), steps=int(steps), save_every=int(save_every), task=task)
+            fit(Path(data), Path(out), task=task, **counts)
         return ExitCode.DONE
 
     return run_with_exit_codes(run)

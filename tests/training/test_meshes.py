@@ -9,7 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from egosim_jax.testing import write_latents
 from tests.flags import devices
+from tests.training.killing import logged
+from tests.training.run_tiny import TASKS
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
@@ -39,6 +42,27 @@ def test_dwm_trains_on_a_mesh_as_on_one_device(tmp_path):
     shared, _ = run((1, 4, 2, 1), tmp_path / "shared.npz", "dwm")
     np.testing.assert_allclose(shared["loss"], alone["loss"], rtol=1e-6)
     np.testing.assert_allclose(shared["curve"], alone["curve"], rtol=1e-5)
+
+
+def test_self_forcing_trains_on_a_mesh_as_on_one_device(tmp_path):
+    """Two devices share a clip: its chunks, their cached keys and values, and the critic's clip."""
+    data = tmp_path / "data"
+    write_latents(data, TASKS["student_dmd"].model)
+    losses = []
+    for count, context in ((1, 1), (4, 2)):
+        out = tmp_path / str(count)
+        command = [sys.executable, "-m", "tests.training.run_tiny", str(data), str(out), "3", "100"]
+        done = subprocess.run(
+            [*command, "student_dmd", str(context)],
+            cwd=ROOT,
+            env=os.environ | devices(count),
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, done.stderr
+        losses.append([[line["loss"], line["critic_loss"]] for line in logged(out)])
+    assert np.shape(losses) == (2, 3, 2)
+    np.testing.assert_allclose(losses[1], losses[0], rtol=1e-6)
 
 
 @pytest.mark.parametrize("mesh", MESHES, ids=str)
