@@ -90,7 +90,7 @@ def convert(
     """
     episode = source.episode
     joints = _path([action.joints_m for action in episode.actions])
-    eyes = _path([a.cameras.world_from_camera[:, :3, 3] for a in episode.actions])
+    poses = _path([action.cameras.world_from_camera for action in episode.actions])
     chosen = _hands(joints, hands)
     backgrounds = _backgrounds(source)
     if base is not None and len(chosen) > 1:
@@ -100,7 +100,12 @@ def convert(
     for hand in chosen:
         grips = grips_of(joints[:, hand], fps=episode.fps)
         placed = place(
-            robot, grips, world_from_up=world_from_up, eyes_m=eyes, fps=episode.fps, base=base
+            robot,
+            grips,
+            world_from_up=world_from_up,
+            world_from_camera=poses,
+            fps=episode.fps,
+            base=base,
         )
         followers.append(Follower(robot=robot, hand=hand, grips=grips, placed=placed))
     found = Conversion(source=source, followers=tuple(followers), backgrounds=backgrounds, drawn=())

@@ -28,7 +28,7 @@ FIRST_STEPS, NEXT_STEPS = 40, 12
 GOOD_TURN = np.radians(15)
 """Direction error up to which a base is taken at once."""
 EYE_M = 0.12
-"""Least distance of the arm's links from the camera."""
+"""Least distance of the arm's links in front of the camera from it."""
 WRIST_M = 0.1
 """Distance from the gripper's wrist within which a link does not hide it."""
 BAD = 10.0
@@ -49,7 +49,7 @@ class Placed:
     track: Track
     """Motion in the base frame."""
     clear: Bool[np.ndarray, " f"]
-    """Mask of the frames in which no link is at the camera."""
+    """Mask of the frames in which no link is close in front of the camera."""
 
 
 def place(
@@ -57,30 +57,29 @@ def place(
     grips: Grips,
     *,
     world_from_up: Float[np.ndarray, "4 4"],
-    eyes_m: Float[np.ndarray, "f 3"],
+    world_from_camera: Float[np.ndarray, "f 4 4"],
     fps: int,
     base: Base | None = None,
 ) -> Placed:
     """Return the base from which the arm reaches most of the path, clear of the camera.
 
-    `world_from_up` is a frame on the table, z upwards. `eyes_m` are the centers of the camera.
-    By default, `base` is searched.
+    `world_from_up` is a frame on the table, z upwards. By default, `base` is searched.
     """
     up_from_grip = invert(world_from_up) @ grips.world_from_grip
-    eyes = transform(invert(world_from_up), eyes_m)
-    moments = np.unique(np.linspace(0, len(eyes) - 1, MOMENTS).astype(int))
+    cameras = invert(world_from_up) @ world_from_camera
+    moments = np.unique(np.linspace(0, len(cameras) - 1, MOMENTS).astype(int))
     facing = _facing(robot)
     bases = (
         [_base(base[:3], np.radians(base[3]))]
         if base
-        else _candidates(robot, up_from_grip[:, :3, 3], eyes, facing)
+        else _candidates(robot, up_from_grip[:, :3, 3], cameras[:, :3, 3], facing)
     )
     tried = []
     for up_from_base in bases:
         solver = Solver(robot, table_m=-up_from_base[2, 3])
         for flip in (np.eye(4), FLIP):
             path = invert(up_from_base) @ up_from_grip @ flip
-            local = transform(invert(up_from_base), eyes)
+            local = invert(up_from_base) @ cameras
             cost, start = _try(solver, path[moments], grips.opening_m[moments], local[moments])
             tried.append((cost, len(tried), up_from_base, path, start))
         if min(t[0] for t in tried[-2:]) < GOOD_TURN:
@@ -90,7 +89,7 @@ def place(
     for _, _, up_from_base, path, start in tried[:MAX_TRACKS]:
         solver = Solver(robot, table_m=-up_from_base[2, 3])
         track = solver.follow(start, path, grips.opening_m, fps=fps)
-        clear = _clear(solver, track, transform(invert(up_from_base), eyes))
+        clear = _clear(solver, track, invert(up_from_base) @ cameras)
         found.append(Placed(world_from_base=world_from_up @ up_from_base, track=track, clear=clear))
         if track.reached[grips.seen].mean() >= ENOUGH and clear.mean() >= ENOUGH:
             break
@@ -99,32 +98,33 @@ def place(
     )
 
 
-def _clear(solver: Solver, track: Track, eyes: np.ndarray) -> Bool[np.ndarray, " f"]:
-    """Return in which frames no link is within `EYE_M` of the camera, in any of 26 directions."""
+def _clear(solver: Solver, track: Track, cameras: np.ndarray) -> Bool[np.ndarray, " f"]:
+    """Return in which frames no link is within `EYE_M` of the camera, in nine directions ahead."""
     mujoco: Any = import_module("mujoco")
 
     mj, clear = solver.robot.mj, []
     data, table = mujoco.MjData(mj), mj.geom(TABLE).id
-    rays = np.array([ray for ray in product((-1.0, 0.0, 1.0), repeat=3) if any(ray)])
+    rays = np.array([(*across, 1.0) for across in product((-1.0, 0.0, 1.0), repeat=2)])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     hits, distances = np.zeros(len(rays), np.int32), np.zeros(len(rays))
-    for q, opening, eye in zip(track.q, track.opening_m, eyes, strict=True):
+    for q, opening, camera in zip(track.q, track.opening_m, cameras, strict=True):
+        eye, toward = camera[:3, 3], (rays @ camera[:3, :3].T).ravel()
         data.qpos[:] = solver.robot.open(q, float(opening))
         mujoco.mj_kinematics(mj, data)
         mujoco.mj_multiRay(
-            mj, data, eye, rays.ravel(), None, True, -1, hits, distances, None, len(rays), EYE_M
+            mj, data, eye, toward, None, True, -1, hits, distances, None, len(rays), EYE_M
         )
         clear.append(not ((hits >= 0) & (hits != table) & (distances < EYE_M)).any())
     return np.array(clear)
 
 
 def _try(
-    solver: Solver, path: np.ndarray, openings: np.ndarray, eyes: np.ndarray
+    solver: Solver, path: np.ndarray, openings: np.ndarray, cameras: np.ndarray
 ) -> tuple[float, np.ndarray]:
     """Return the cost of a base, and the posture at the first moment.
 
     The cost is the mean direction error in radians, and `BAD` for each moment that is not reached,
-    and for each in which the arm is at the camera or hides the gripper from it.
+    and for each in which the arm is close in front of the camera or hides the gripper from it.
     """
     mujoco: Any = import_module("mujoco")
 
@@ -132,7 +132,7 @@ def _try(
     data = mujoco.MjData(mj)
     q = start = robot.home
     cost = 0.0
-    for number, (pose, opening, eye) in enumerate(zip(path, openings, eyes, strict=True)):
+    for number, (pose, opening, camera) in enumerate(zip(path, openings, cameras, strict=True)):
         opening = float(np.clip(opening, robot.openings_m[0], robot.openings_m[-1]))
         q = solver.approach(q, pose, opening, steps=NEXT_STEPS if number else FIRST_STEPS)
         start = q if number == 0 else start
@@ -141,8 +141,9 @@ def _try(
         grip = grip_of(robot, data)
         miss = bool(np.linalg.norm(grip[:3, 3] - pose[:3, 3]) > REACHED_M)
         turn = np.arccos(np.clip((np.sum(grip[:3, :3] * pose[:3, :3]) - 1) / 2, -1, 1))
-        near = bool(np.linalg.norm(data.xpos[1:] - eye, axis=1).min() < EYE_M)
-        cost += float(turn) + BAD * (miss + (near or _hides(solver, data, eye)))
+        links = transform(invert(camera), data.xpos[1:])
+        near = bool(((links[:, 2] > 0) & (np.linalg.norm(links, axis=1) < EYE_M)).any())
+        cost += float(turn) + BAD * (miss + (near or _hides(solver, data, camera[:3, 3])))
     return cost / len(path), start
 
 

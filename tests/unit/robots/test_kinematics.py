@@ -5,6 +5,7 @@ import pytest
 
 pytest.importorskip("mink")
 
+from egosim_jax.geometry import look_at
 from egosim_jax.robots.ik import Solver
 from egosim_jax.robots.models import GRIP
 from egosim_jax.robots.placement import place
@@ -14,6 +15,8 @@ from tests.unit.robots.toy import TOY, make_toy
 FPS, FRAMES = 8, 9
 DOWN = np.diag([1.0, -1.0, -1.0])
 """Axes of a grip from above."""
+EYE = np.array([0.0, -0.2, 0.5])
+"""Place of the camera."""
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +32,11 @@ def path_to(*places_m):
     for axis, values in enumerate(np.transpose(places_m)):
         poses[:, axis, 3] = np.interp(np.linspace(0, 1, FRAMES), knots, values)
     return poses
+
+
+def watch(eye_m, target_m):
+    """Return the pose of a camera that looks at a place."""
+    return look_at(eye_m, np.asarray(target_m), up=np.array([0.0, 0.0, 1.0]))
 
 
 def gripper(poses, opening_m):
@@ -104,21 +112,25 @@ def test_the_table_stops_the_gripper(toy):
 def test_a_base_is_found_from_which_the_whole_path_is_reached(toy):
     poses = path_to([0.1, 0.3, 0.15], [-0.1, 0.3, 0.05], [0.0, 0.2, 0.15])
     grips = grips_of(gripper(poses, 0.06), fps=FPS)
-    eyes = np.tile([0.0, -0.2, 0.5], (FRAMES, 1))
-    placed = place(toy, grips, world_from_up=np.eye(4), eyes_m=eyes, fps=FPS)
+    cameras = np.repeat(watch(EYE, [0.0, 0.3, 0.1])[None], FRAMES, axis=0)
+    view = {"world_from_up": np.eye(4), "world_from_camera": cameras, "fps": FPS}
+    placed = place(toy, grips, **view)
     assert placed.track.reached.all()
     assert placed.clear.all()
     base = (*placed.world_from_base[:2, 3], 0.0, 0.0)
-    given = place(toy, grips, world_from_up=np.eye(4), eyes_m=eyes, fps=FPS, base=base)
+    given = place(toy, grips, base=base, **view)
     np.testing.assert_allclose(given.world_from_base[:3, 3], base[:3])
     np.testing.assert_allclose(given.world_from_base[:3, :3], np.eye(3))
 
 
-def test_frames_in_which_the_arm_is_at_the_camera_are_known(toy):
+def test_frames_in_which_the_arm_is_close_in_front_of_the_camera_are_known(toy):
     poses = path_to([0.1, 0.3, 0.15], [-0.1, 0.3, 0.05], [0.0, 0.2, 0.15])
     grips = grips_of(gripper(poses, 0.06), fps=FPS)
-    eyes = np.tile([0.0, -0.2, 0.5], (FRAMES, 1))
-    eyes[5] = poses[5, :3, 3] + [0, 0, 0.03]  # between the jaws
+    cameras = np.repeat(watch(EYE, [0.0, 0.3, 0.1])[None], FRAMES, axis=0)
+    jaws = poses[5, :3, 3] + [0, 0, 0.03]
+    cameras[5] = watch(jaws, jaws + [0, 0.1, 1])  # from between the jaws into the hand
+    cameras[7] = watch(jaws, jaws + [0, 1, 0])  # the arm is above and behind this one
     base = (0.0, -0.1, 0.0, 90.0)
-    placed = place(toy, grips, world_from_up=np.eye(4), eyes_m=eyes, fps=FPS, base=base)
+    view = {"world_from_up": np.eye(4), "world_from_camera": cameras, "fps": FPS}
+    placed = place(toy, grips, base=base, **view)
     np.testing.assert_array_equal(np.flatnonzero(~placed.clear), [5])
