@@ -1,7 +1,6 @@
 """Make a scene of two boxes, as a depth camera sees it, and a hand that pushes one of them.
 
-Writes what `egosim episode make` reads. World: x right, y away from the wearer, z up, in meters.
-"""
+Writes what `egosim episode make` reads. World: x right, y away from the wearer, z up, in meters."""
 
 import json
 from pathlib import Path
@@ -30,12 +29,12 @@ np.savez(out / "depth.npz", depth_m=np.nan_to_num(hit["t_hit"], posinf=0))  # 0:
 
 push = [[-0.11, 0.05, 0.035, 0], [-0.11, 0.05, 0.035, 0.3], [0.04, 0.05, 0.035, 0.3]]
 leave = [[0.04, 0.05, 0.035, 0.3], [0.04, 0.05, 0.035, 0], [0.1, -0.1, 0.1, 0]]
-prompts = ["The right hand pushes the red box.", "The right hand moves away."]
+prompts = "The right hand pushes the red box.", "The right hand moves away."
 for number, keys in enumerate([push, leave]):  # at frames 0, 4 and 16: x, y, z, closure
     poses = np.stack([np.interp(np.arange(17), [0, 4, 16], key) for key in np.transpose(keys)], 1)
     grips = [Grip(point_m=row[:3], yaw=0.0, pitch=0.0, closure=row[3]) for row in poses]
     joints = [[grip.pose("human", "right")[0].tolist()] for grip in grips]
     clip = {"world_from_camera": [camera.tolist()] * 17, "intrinsics_px": intrinsics_px.tolist()}
     clip |= {"joints_m": joints, "prompt": prompts[number]}
-    (out / f"clip_{number + 1}.json").write_text(json.dumps(clip))
-print(out)
+    print(path := out / f"clip_{number + 1}.json")
+    path.write_text(json.dumps(clip))

@@ -257,11 +257,11 @@ def test_the_doctor_lists_what_is_missing(weights, tmp_path, capsys, monkeypatch
     assert "pip install 'egosim-jax[viewer]'" in said
     assert re.search(r"egosim_14b .* 45\.6\d GB", said)
     found = [line for line in said.splitlines() if "mine" in line.replace(" ", "")]
-    assert len(found) == 4
+    assert len(found) == 5  # four networks, and the last line
 
 
 def test_the_doctor_fails_where_a_library_is_missing(capsys, monkeypatch):
     monkeypatch.setattr(doctor, "NATIVE", ("no_such_module",))
-    monkeypatch.setattr(doctor, "_print_models", lambda console, folders: None)
+    monkeypatch.setattr(doctor, "_print_models", lambda console: None)
     assert main(["doctor"]) == 1
     assert "no_such_module cannot be imported" in capsys.readouterr().out
