@@ -26,14 +26,14 @@ Commands = Union[  # noqa: UP007 - a tuple of members
 
 def main(args: Sequence[str] | None = None, *, program: str = "egosim-train") -> int:
     """Run `egosim-train`; with `args`, in a process that may already have used its devices."""
-    from egosim_jax.train.distributed import training_context
-
     options = list(sys.argv[1:] if args is None else args)
     if options[:1] == ["tabletop"] and "--online" in options:  # a parser for machines without tyro
         from egosim_jax.train.online.__main__ import main as train_online
 
         given = [option for option in options[1:] if option != "--online"]
         return train_online(given, program=f"{program} tabletop --online")
+    from egosim_jax.train.distributed import training_context
+
     without_training = any(option.partition("=")[0] == "--preflight" for option in options)
     return command.main(
         Commands,

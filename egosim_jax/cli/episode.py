@@ -354,7 +354,7 @@ def summary(episode: episodes.Episode) -> str:
     handless = [
         f"clip {number}"
         for number, action in enumerate(episode.actions, start=1)
-        if np.isnan(action.joints_m).any(axis=(2, 3)).all()
+        if not np.isfinite(action.joints_m).any()
     ]
     where = f" (none in {', '.join(handless)})" if handless else ""
     return (

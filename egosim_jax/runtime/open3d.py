@@ -45,6 +45,16 @@ def point_cloud(points_m: Float[np.ndarray, "n 3"]) -> Any:
     return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_m.astype(np.float64)))
 
 
+def nearest(
+    points_m: Float[np.ndarray, "n 3"], others_m: Float[np.ndarray, "m 3"]
+) -> Float[np.ndarray, " n"]:
+    """Return the distance of each point to the nearest of the others; infinite without others."""
+    if not len(points_m) or not len(others_m):
+        return np.full(len(points_m), np.inf)
+    distances = point_cloud(points_m).compute_point_cloud_distance(point_cloud(others_m))
+    return np.asarray(distances)
+
+
 def _native_spec() -> ModuleSpec | None:
     """Return the native module of a build for CPUs; a build for GPUs chooses one of two itself."""
     found = find_spec("open3d")

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from egosim_jax.geometry import cameras_in_object_frame, invert, pixels_of, transform
-from egosim_jax.runtime.open3d import load_open3d, point_cloud
+from egosim_jax.runtime.open3d import load_open3d, nearest, point_cloud
 from egosim_jax.state.filter import disappeared_objects
 from egosim_jax.state.new_objects import with_objects
 from egosim_jax.state.tsdf import Fusion, surface, valid_depth_mask
@@ -67,7 +67,7 @@ def fuse(state: SceneState, perceived: Perceived, *, fusion: Fusion | None = Non
     # then take the color of a neighbor.
     new = replace(new, colors=transfer_colors(new, old))
     old = carve_free_space(old, perceived, valid)
-    old = old[~_has_neighbor(old.points_m, new.points_m, REPLACE_M)]
+    old = old[nearest(old.points_m, new.points_m) > REPLACE_M]
     points = canonical_sort(concat([old, new]))
     poses = {n: path[-1] for n, path in perceived.world_from_object.items()}
     return replace(
@@ -191,16 +191,6 @@ def _remove_outliers(new: _Points) -> _Points:
     cloud = point_cloud(new.points_m)
     _, kept = cloud.remove_statistical_outlier(OUTLIER_NEIGHBORS, OUTLIER_DEVIATIONS)
     return new[np.array(kept, int)]
-
-
-def _has_neighbor(
-    points_m: Float32[np.ndarray, "n 3"], others_m: Float32[np.ndarray, "m 3"], radius_m: float
-) -> Bool[np.ndarray, " n"]:
-    """Return which points have a neighbor among the others, within a radius in meters."""
-    if not len(points_m) or not len(others_m):
-        return np.zeros(len(points_m), bool)
-    distances = point_cloud(points_m).compute_point_cloud_distance(point_cloud(others_m))
-    return np.asarray(distances) <= radius_m
 
 
 def transfer_colors(new: _Points, old: _Points) -> UInt8[np.ndarray, "n 3"]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from egosim_jax.runtime.open3d import load_open3d, point_cloud
+from egosim_jax.runtime.open3d import load_open3d, nearest
 
 ON_SURFACE_M = 0.01
 """Maximum distance in meters of a point on a surface."""
@@ -79,16 +79,6 @@ def distance_to_mesh(
         o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(triangles.astype(np.uint32))
     )
     return scene.compute_distance(o3d.core.Tensor(points_m.astype(np.float32))).numpy()
-
-
-def nearest(
-    points_m: Float[np.ndarray, "n 3"], others_m: Float[np.ndarray, "m 3"]
-) -> Float[np.ndarray, " n"]:
-    """Return the distance of each point to the nearest of the others; infinite without others."""
-    if not len(points_m) or not len(others_m):
-        return np.full(len(points_m), np.inf)
-    distances = point_cloud(points_m).compute_point_cloud_distance(point_cloud(others_m))
-    return np.asarray(distances)
 
 
 def _percent(good: np.ndarray) -> float:
