@@ -179,7 +179,8 @@ class FromAnnotation:
     """Make an episode of a recorded video, from a clip that `egosim data annotate` accepted.
 
     The scene is the clip's first frame, and the actions are its cameras and hands. The ground truth
-    is the video, cut into clips of the model's length, size and frame rate.
+    is the video, cut into clips of the model's length, size and frame rate. To begin later, cut the
+    video before annotation.
     """
 
     clip: Annotated[Path, tyro.conf.Positional]

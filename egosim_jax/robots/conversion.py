@@ -224,6 +224,7 @@ def _report(follower: Follower, fps: int) -> dict[str, Any]:
         "robot": arm.name,
         "hand": follower.hand,
         "world_from_base": base.round(6).tolist(),
+        "largest_opening_m": follower.robot.largest_m,
         "frames": len(joints),
         "frames_without_hand": int((~grips.seen).sum()),
         "frames_at_camera": int((~follower.placed.clear).sum()),
@@ -247,7 +248,7 @@ def export(conversion: Conversion, folder: Path) -> None:
     for follower in conversion.followers:
         prefix = f"{follower.hand}." if len(conversion.followers) > 1 else ""
         names += [f"{prefix}{name}.pos" for name in conversion.arm.joints]
-        names += [f"{prefix}gripper.opening_m"]
+        names += [f"{prefix}gripper.opening"]
         rows.append(rows_of(follower))
         grips[f"observation.{prefix}grip"] = poses_of(follower)
     table = np.concatenate(rows, axis=1)
@@ -295,9 +296,10 @@ def triplets_of(
 
 
 def rows_of(follower: Follower) -> Float[np.ndarray, "f d"]:
-    """Return joint positions and opening in each frame."""
-    track = follower.placed.track
-    return np.concatenate([track.q[:, follower.robot.joint_at], track.opening_m[:, None]], axis=1)
+    """Return joint positions in radians and the opening, from 0 to 1, in each frame."""
+    track, robot = follower.placed.track, follower.robot
+    opening = track.opening_m[:, None] / robot.largest_m
+    return np.concatenate([track.q[:, robot.joint_at], opening], axis=1)
 
 
 def poses_of(follower: Follower) -> Float[np.ndarray, "f 7"]:

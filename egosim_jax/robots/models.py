@@ -51,6 +51,11 @@ class RobotModel:
     """Place of the grip, in the frame of the gripper's body, at each opening."""
 
     @property
+    def largest_m(self) -> float:
+        """Largest opening of the gripper."""
+        return float(self.openings_m[-1])
+
+    @property
     def home(self) -> Float[np.ndarray, " q"]:
         """Positions of all joints with the arm at home and the gripper open."""
         q = self.mj.qpos0.copy()

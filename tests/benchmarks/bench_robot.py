@@ -77,7 +77,7 @@ def replay_error(found: Conversion, folder: Path) -> float:
     for row, grip in zip(rows, grips, strict=True):
         q = robot.home
         q[robot.joint_at] = row[:joints]
-        data.qpos[:] = robot.open(q, row[joints])
+        data.qpos[:] = robot.open(q, row[joints] * robot.largest_m)
         mujoco.mj_kinematics(robot.mj, data)
         errors.append(np.linalg.norm(grip_of(robot, data)[:3, 3] - grip[:3]))
     return float(max(errors))

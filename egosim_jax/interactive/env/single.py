@@ -312,7 +312,9 @@ class WorldEnv(gymnasium.Env):
         running = self._continued()
         chunk = running.chunk(actions, prompt=prompt)
         self._open = None
-        return self._advance(chunk, *running.simulate(chunk))
+        with show_phases(), phase(f"simulates chunk {running.chunks + 1}", only_if_long=True):
+            made = running.simulate(chunk)
+        return self._advance(chunk, *made)
 
     def part_step(
         self, actions: Float[np.ndarray, "k d"], *, prompt: str | None = None
@@ -327,7 +329,8 @@ class WorldEnv(gymnasium.Env):
             self._open = running.open(prompt)
         step = self._open
         try:
-            step.step(actions)
+            with show_phases(), phase(f"simulates part {step.done + 1}", only_if_long=True):
+                step.step(actions)
         except FloatingPointError:
             self._open = None  # no part of this clip can follow
             raise

@@ -172,11 +172,12 @@ class WorldVectorEnv(VectorEnv):
             running.chunk(rows, prompt=prompt)
             for running, rows, prompt in zip(self.running, actions, texts, strict=True)
         ]
-        made = [
-            self._threads.submit(running.simulate, chunk)
-            for running, chunk in zip(self.running, chunks, strict=True)
-        ]
-        wait(made)  # all: a step that still runs must not outlive an error of another
+        with show_phases(), phase(f"simulates {self.num_envs} chunks", only_if_long=True):
+            made = [
+                self._threads.submit(running.simulate, chunk)
+                for running, chunk in zip(self.running, chunks, strict=True)
+            ]
+            wait(made)  # all: a step that still runs must not outlive an error of another
         steps, known = zip(*(future.result() for future in made), strict=True)
         results = [
             reward(Outcome(first=running.start.state, step=step))

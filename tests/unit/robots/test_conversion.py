@@ -80,10 +80,12 @@ def test_the_dataset_replays_the_path_of_the_grip(converted, tmp_path):
     assert (grips[1:, 3:] * grips[:-1, 3:]).sum(axis=1).min() > 0  # no quaternion changes its sign
     robot = converted.followers[0].robot
     data = mujoco.MjData(robot.mj)
-    for row, grip in zip(rows, grips, strict=True):
+    openings = rows[:, names.index("gripper.opening")]
+    assert 0 <= openings.min() < openings.max() <= 1
+    for row, grip, opening in zip(rows, grips, openings, strict=True):
         q = robot.home
         q[robot.joint_at] = row[: len(TOY.joints)]
-        data.qpos[:] = robot.open(q, row[names.index("gripper.opening_m")])
+        data.qpos[:] = robot.open(q, opening * robot.largest_m)
         mujoco.mj_kinematics(robot.mj, data)
         np.testing.assert_allclose(grip_of(robot, data)[:3, 3], grip[:3], atol=1e-5)
 

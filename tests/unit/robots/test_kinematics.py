@@ -95,6 +95,16 @@ def test_a_path_within_reach_is_followed_within_the_limits(toy):
     assert track.clearance_m.min() > 0
 
 
+def test_the_gripper_closes_gradually_at_most_at_its_speed(toy):
+    poses = path_to([0.35, 0, 0.2], [0.35, 0, 0.2])
+    openings = np.where(np.arange(FRAMES) < FRAMES // 2, 0.2, 0.07)  # at most 0.08 is possible
+    found = Solver(toy, table_m=0.0).follow(toy.home, poses, openings, fps=16).opening_m
+    np.testing.assert_allclose(found[[0, -1]], [0.08, 0.07], atol=1e-3)
+    steps = -np.diff(found)
+    assert (steps >= -1e-12).all()
+    assert steps.max() < np.ptp(found) / 2
+
+
 def test_a_path_out_of_reach_says_by_how_much(toy):
     track = follow(toy, path_to([0.35, 0, 0.2], [0.95, 0, 0.2]))
     assert track.reached[0]
