@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d
 
 from egosim_jax.robots.models import GRIP, TABLE, RobotModel, grip_of
+from egosim_jax.robots.retarget import GRADUAL_S
 
 REACHED_M = 0.005
 """Distance of the robot's pinch point from the hand's up to which a frame is reached."""
@@ -25,8 +26,6 @@ POSTURE_COST = 1e-3
 """Meters of the pinch point that weigh as much as a radian away from home."""
 STEPS = 12
 """Solutions per frame of a video."""
-GRIPPER_SMOOTHING_S = 0.08
-"""Standard deviation of the filter of openings over time: a gripper does not stop at once."""
 SEARCH_STEP_S = 0.1
 """Time of a step of a search, at the joints' maximum speed."""
 CLEARANCE_M, WATCHED_M = 0.001, 0.04
@@ -153,7 +152,7 @@ class Solver:
     def _limit_opening(self, opening_m: np.ndarray, fps: int) -> Float[np.ndarray, " f"]:
         """Return the openings that the gripper can have, at most at its speed, without jerks."""
         wanted = np.clip(opening_m, self.robot.openings_m[0], self.robot.openings_m[-1])
-        wanted = gaussian_filter1d(wanted, GRIPPER_SMOOTHING_S * fps, mode="nearest")
+        wanted = gaussian_filter1d(wanted, GRADUAL_S * fps, mode="nearest")
         step, found = self.robot.arm.gripper.speed_m_s / fps, [wanted[0]]
         for value in wanted[1:]:
             found.append(np.clip(value, found[-1] - step, found[-1] + step))

@@ -16,7 +16,9 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 SMOOTHING_S = 0.04
-"""Standard deviation of the filter over time, in seconds: estimated hands tremble."""
+"""Standard deviation of the filter of places over time, in seconds: estimated hands tremble."""
+GRADUAL_S = 0.08
+"""The same for directions and openings: both change at once when fingers close, no gripper does."""
 MIN_ACROSS_M = 1e-3
 """Distance of the fingertips below which they give no direction."""
 
@@ -58,7 +60,7 @@ def grips_of(joints_m: Float[np.ndarray, "f j 3"], *, fps: int) -> Grips:
     place = _smooth(pinch, known, sigma)
     turns = Rotation.from_matrix(turns)
     quaternions = continuous(turns.as_quat())
-    turns = Rotation.from_quat(_smooth(quaternions, known, sigma))
+    turns = Rotation.from_quat(_smooth(quaternions, known, GRADUAL_S * fps))
     poses = np.tile(np.eye(4), (len(known), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = turns.as_matrix(), place
     nearest = _nearest(known, len(joints_m))
