@@ -20,7 +20,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from egosim_jax.geometry import invert, pixels_of, transform, upward
+from egosim_jax.geometry import invert, pixels_of, transform
 from egosim_jax.perception.extent import (
     Candidate,
     best_of,
@@ -43,6 +43,7 @@ from egosim_jax.perception.grasps import (
 )
 from egosim_jax.perception.growth import NEW, Growth, clusters_without_id
 from egosim_jax.perception.hulls import hull_on_plane
+from egosim_jax.perception.object_models import ObjectModels, Support
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.perception.pose_refinement import (
     ColorCost,
@@ -51,8 +52,7 @@ from egosim_jax.perception.pose_refinement import (
     Refinement,
     refine_pose,
 )
-from egosim_jax.state.new_objects import next_object_id, with_objects
-from egosim_jax.state.planes import support_planes
+from egosim_jax.state.new_objects import next_object_id
 from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState, check_counts
 from egosim_jax.types.data import object_name
 
@@ -67,8 +67,6 @@ class TrackObjects:
     """Maximum change of the distance between fingertips during a hold, in meters."""
     ends: int = 8
     """Maximum number of ends that are compared if the time of the release is unknown."""
-    min_points: int = 30
-    """Minimum number of points of an object, and of a surface around it."""
     compared_points: int = 150
     """Approximate number of an object's points that a trial compares."""
     min_visible: float = 0.2
@@ -87,10 +85,8 @@ class TrackObjects:
     A generated clip may leave an object where the state has it, as if no hand had taken it."""
     prompt_prior: float = 0.9
     """Cost factor of an object that the prompt names."""
-    plane_tolerance_m: float = 0.006
-    """Inlier distance of the supporting plane, in meters."""
-    plane_radius_m: float = 0.15
-    """Radius around the object's center in which points determine its plane, in meters."""
+    support: Support = field(default_factory=Support)
+    """Fit of the supporting planes."""
     blur_px: float = 0.7
     """Sigma of the Gaussian blur of the clip: generated frames are softer than points."""
     growth: Growth = field(default_factory=Growth)
@@ -106,7 +102,7 @@ class TrackObjects:
 
     def __post_init__(self) -> None:
         """Check that the numbers of points, the tolerance and the blur are positive."""
-        check_counts({n: getattr(self, n) for n in ("ends", "min_points", "compared_points")})
+        check_counts({n: getattr(self, n) for n in ("ends", "compared_points")})
         for name in ("opening_tolerance_m", "blur_px"):
             if getattr(self, name) <= 0:
                 raise InputError(f"{name} must be positive, not {getattr(self, name)}.")
@@ -122,14 +118,15 @@ class TrackObjects:
             so_far.require(name, "TrackObjects") for name in ("cameras", "joints_m", "object_ids")
         )
         action = replace(action, cameras=cameras, joints_m=joints)
-        found, new, notes = estimate_object_motion(clip, action, state, ids < 0, self)
+        models = ObjectModels(state, cameras.world_from_camera[0], self.support)
+        found, new, notes = estimate_object_motion(clip, action, models, ids < 0, self)
         frames, moved = np.arange(len(clip.frames)), list(found.values())
         held = {hand: motion.model.number for hand, motion in found.items() if motion.holds_to_end}
         for hand, number in state.held.items():
             in_view = hand < joints.shape[1] and len(seen_frames(joints[:, hand]))
             if not in_view:
                 held[hand] = number
-        held = {**_closed_on(action, with_objects(state, new), found, self), **held}
+        held = {**_closed_on(action, models, found, self), **held}
         return replace(
             so_far,
             new_objects=new,
@@ -147,7 +144,7 @@ class TrackObjects:
 def estimate_object_motion(
     clip: Clip,
     action: Action,
-    state: SceneState,
+    models: ObjectModels,
     hidden: Bool[np.ndarray, "f h w"],
     config: TrackObjects,
 ) -> tuple[dict[int, ObjectMotion], dict[int, Float32[np.ndarray, "n 3"]], list[str]]:
@@ -156,7 +153,7 @@ def estimate_object_motion(
     Each hand moves at most one object. If two hands claim an object, the hand that explains the
     colors better gets it. `hidden` marks the pixels that hands cover. A hand may
     be missing from some frames (`Grip`). Without an object with an id in its grip, a hand may move
-    a new one: it gets the next free id.
+    a new one: it gets the next free id, and `models` has it then.
     """
     shown = _smooth(clip.frames, config.blur_px)
     found: dict[int, tuple[float, int, ObjectMotion]] = {}
@@ -165,19 +162,20 @@ def estimate_object_motion(
     for hand in range(action.joints_m.shape[1]):
         joints = action.joints_m[:, hand]
         if len(seen_frames(joints)) > MIN_HELD:
-            best, note = _best_candidate(hand, action, state, shown, hidden, config)
+            best, note = _best_candidate(hand, action, models, shown, hidden, config)
             if best is not None and best[1].model.number == NEW:
                 change, motion = best
-                number = next_object_id(state)
+                number = next_object_id(models.state)
                 motion = replace(motion, model=replace(motion.model, number=number))
                 best = change, motion
                 new[number] = motion.model.points_m.astype(np.float32)
-                state = with_objects(state, new)
+                models.add(new)
                 note = f"moved something without an id: it is object {number} now"
             if note:
                 notes.append(f"hand {hand} {note}")
             if best is not None:
                 change, motion = best
+                state = models.state
                 others = state.points_m[state.object_ids != motion.model.number]
                 motion = snap(fall(motion, others, clip.fps), others)
                 motion = refine_pose(
@@ -191,7 +189,7 @@ def estimate_object_motion(
 
 
 def _closed_on(
-    action: Action, state: SceneState, found: Mapping[int, ObjectMotion], config: TrackObjects
+    action: Action, models: ObjectModels, found: Mapping[int, ObjectMotion], config: TrackObjects
 ) -> dict[int, int]:
     """Return the object that each hand closes on until the clip ends: it has not held it yet."""
     motions = {motion.model.number: motion.path[-1] for motion in found.values()}
@@ -204,8 +202,8 @@ def _closed_on(
         tips = complete_hand(joints, seen)[:, TIPS[action.kind]]
         if not closes_to_end(tips, config.opening_tolerance_m):
             continue
-        for number in _near_tips(tips, state, config):
-            model = object_model(number, state, config, action.cameras.world_from_camera[0])
+        for number in _near_tips(tips, models, config):
+            model = models.of(number)
             end = transform(motions.get(number, np.eye(4)), model.points_m)
             faces = hull_on_plane(end, model.plane)
             if faces is not None and encloses(faces, tips[-1]):
@@ -216,7 +214,7 @@ def _closed_on(
 def _best_candidate(
     hand: int,
     action: Action,
-    state: SceneState,
+    models: ObjectModels,
     shown: Float32[np.ndarray, "f h w 3"],
     hidden: Bool[np.ndarray, "f h w"],
     config: TrackObjects,
@@ -225,6 +223,7 @@ def _best_candidate(
 
     If the hand holds no object that has an id, it may move one that has none.
     """
+    state = models.state
     before = state.held.get(hand, 0)
     grip = Grip.of(
         action.joints_m[:, hand],
@@ -237,8 +236,8 @@ def _best_candidate(
     scene = action.cameras, state, shown, hidden, config.color
     found: list[list[Candidate]] = []
     held = False
-    for number in _near_tips(grip.tips_m, state, config):
-        model = object_model(number, state, config, action.cameras.world_from_camera[0])
+    for number in _near_tips(grip.tips_m, models, config):
+        model = models.of(number)
         held |= any(grip.has(model.points_m, grasped) for grasped in grip.grasps)
         name = state.names.get(number, "").lower()
         prior = config.prompt_prior if name and name in action.prompt.lower() else 1.0
@@ -254,7 +253,11 @@ def _best_candidate(
         moved = [ranked for ranked in tried if ranked]
         if moved:
             part = moving_part(moved[0][0][1], action.cameras, shown, hidden, config.color)
-            if config.min_points <= len(part.points_m) < config.part * len(growths[0].points_m):
+            if (
+                config.support.min_points
+                <= len(part.points_m)
+                < config.part * len(growths[0].points_m)
+            ):
                 ranked = _best_motions(part, grip, 1.0, action.cameras, shown, hidden, config)
                 moved += [ranked] if ranked else []
             found.append(moved[choose_extent([r[0] for r in moved], growths, *scene)])
@@ -316,78 +319,9 @@ def _best_motions(
 
 
 def _near_tips(
-    tips_m: Float[np.ndarray, "f t 3"], state: SceneState, config: TrackObjects
+    tips_m: Float[np.ndarray, "f t 3"], models: ObjectModels, config: TrackObjects
 ) -> list[int]:
-    """Return the ids of the objects near a fingertip."""
-    tips = tips_m.reshape(-1, 3)
-    near = []
-    for number in np.unique(state.object_ids[state.object_ids > 0]).tolist():
-        points = state.points_m[state.object_ids == number]
-        if len(points) >= config.min_points:
-            some = points[:: max(1, len(points) // config.compared_points)]
-            gaps = np.linalg.norm(tips[:, None] - some[None], axis=-1)
-            if gaps.min() <= config.reach_m:
-                near.append(number)
-    return near
-
-
-def object_model(
-    number: int,
-    state: SceneState,
-    config: TrackObjects,
-    world_from_camera: Float[np.ndarray, "4 4"],
-) -> ObjectModel:
-    """Return the model of an object. Its plane is horizontal if no surface is around it.
-
-    An object in a hand last rested where it was first observed, as far as the state knows.
-    """
-    own = state.object_ids == number
-    points = state.points_m[own].astype(float)
-    return ObjectModel(
-        number=number,
-        points_m=points,
-        colors=state.colors[own].astype(np.float32),
-        plane=_support_plane(
-            points, state.points_m[~own], config, *upward(state, world_from_camera)
-        ),
-        since_rest=_since_rest(number, points, state),
-    )
-
-
-def _since_rest(
-    number: int, points_m: Float[np.ndarray, "n 3"], state: SceneState
-) -> Float[np.ndarray, "4 4"] | None:
-    """Return the motion of an object in a hand since it rested; None for others and on a hinge."""
-    pose = state.world_from_object.get(number)
-    if pose is None or number not in state.held.values():
-        return None
-    rested = transform(invert(pose), points_m)
-    return None if is_along_edge(rested, pose[None]) else pose
-
-
-def _support_plane(
-    points_m: Float[np.ndarray, "n 3"],
-    others_m: Float32[np.ndarray, "m 3"],
-    config: TrackObjects,
-    up: Float[np.ndarray, " 3"],
-    eye_m: Float[np.ndarray, " 3"] | None,
-) -> Float[np.ndarray, " 4"]:
-    """Fit the horizontal plane (a, b, c, d) with the most inliers around an object (RANSAC).
-
-    A box next to the object may have more points than the ground, so vertical planes are excluded.
-    Without a horizontal one, return a plane of unknown height. `up` and `eye_m` as in `upward`.
-    """
-    distances = np.linalg.norm(others_m - points_m.mean(axis=0), axis=1)
-    near = others_m[distances < config.plane_radius_m]
-    found = support_planes(
-        near,
-        up,
-        eye_m=eye_m,
-        tolerance_m=config.plane_tolerance_m,
-        min_points=config.min_points,
-        max_planes=1,
-    )
-    return found[0].plane if found else np.array([*up, np.nan])
+    return models.near(tips_m, reach_m=config.reach_m, compared=config.compared_points)
 
 
 def _cost(

@@ -10,16 +10,21 @@ refines the last pose.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
 from egosim_jax.geometry import cameras_in_object_frame, invert, project, transform
-from egosim_jax.perception.object_motion import TrackObjects, object_model
+from egosim_jax.perception.object_models import ObjectModels, Support
 from egosim_jax.perception.pipeline import Observation
-from egosim_jax.perception.pose_refinement import ObjectModel, ObjectMotion, Refinement, refine_pose
+from egosim_jax.perception.pose_refinement import (
+    ColorCost,
+    ObjectModel,
+    ObjectMotion,
+    Refinement,
+    refine_pose,
+)
 from egosim_jax.rendering.reference import splat
 from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState, check_counts
 
@@ -45,8 +50,12 @@ class TrackMasks:
     """Relative depth error with the same cost as one pixel."""
     point_px: int = 2
     """Size of the object's rendered points, in pixels."""
-    model: TrackObjects = field(default_factory=partial(TrackObjects, refinement=Refinement()))
-    """Supporting planes, comparison of colors, and refinement of the last pose."""
+    support: Support = field(default_factory=Support)
+    """Fit of the supporting planes."""
+    color: ColorCost = field(default_factory=ColorCost)
+    """Comparison of the clip's colors with the predicted colors."""
+    refinement: Refinement = field(default_factory=Refinement)
+    """Refinement of each object's last pose."""
 
     def __post_init__(self) -> None:
         """Check that the numbers and the depth error are positive."""
@@ -65,12 +74,13 @@ class TrackMasks:
         gray = gray_frames(clip.frames)
         known = set(np.unique(state.object_ids[state.object_ids > 0]).tolist())
         motions, planes = {}, {}
+        models = ObjectModels(state, cameras.world_from_camera[0], self.support)
         for number in sorted(known & set(np.unique(ids).tolist())):
             points = state.points_m[state.object_ids == number].astype(float)
             path = self.follow(points, gray, ids == number, depth, cameras)
             moving = _moving_frames(points, path, cameras, self.min_motion_px)
             if moving.any():
-                model = object_model(number, state, self.model, cameras.world_from_camera[0])
+                model = models.of(number)
                 motions[number] = self._refine(model, path, moving, clip, cameras, state, ids)
                 planes[number] = model.plane
         return replace(so_far, motions=motions, support_planes=planes)
@@ -191,10 +201,8 @@ class TrackMasks:
             model=model, grasped=grasped, released=max(last, grasped + 1), path=path
         )
         shown = clip.frames.astype(np.float32)
-        refined = refine_pose(
-            motion, cameras, state, shown, ids < 0, self.model.refinement, self.model.color
-        )
-        return refined.path
+        hidden = ids < 0
+        return refine_pose(motion, cameras, state, shown, hidden, self.refinement, self.color).path
 
 
 def _residuals(

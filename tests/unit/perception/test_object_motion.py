@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from egosim_jax.perception.falling import fall, snap
-from egosim_jax.perception.object_motion import TrackObjects, _support_plane, object_model
+from egosim_jax.perception.object_models import ObjectModels, Support
 from egosim_jax.perception.pose_refinement import ObjectModel, ObjectMotion
 from egosim_jax.types import SceneState
 
@@ -48,7 +48,7 @@ def test_the_supporting_plane_is_the_same_in_every_run():
     others = np.concatenate([table, wall]).astype(np.float32)
     points = rng.uniform(-0.03, 0.03, (200, 3))
     z = np.array([0.0, 0.0, 1.0])
-    planes = {_support_plane(points, others, TrackObjects(), z, None).tobytes() for _ in range(12)}
+    planes = {Support().plane(points, others, z, None).tobytes() for _ in range(12)}
     assert len(planes) == 1
     normal = np.frombuffer(planes.pop())[:3]
     assert abs(normal[2]) > 0.99
@@ -66,7 +66,7 @@ def test_an_object_without_a_surface_around_it_has_a_horizontal_plane(provenance
         intrinsics_px=np.eye(3),
         provenance=provenance,
     )
-    plane = object_model(1, state, TrackObjects(), np.eye(4)).plane
+    plane = ObjectModels(state, np.eye(4), Support()).of(1).plane
     np.testing.assert_array_equal(plane[:3], up)
     assert np.isnan(plane[3])
 
@@ -83,7 +83,7 @@ def test_the_side_of_a_box_supports_nothing(up, eye_m):
     wall = rng.uniform(-0.1, 0.1, (2000, 3)) * [1, 0, 1] + [0, 0.09, 0.1]
     others = np.concatenate([table, wall]).astype(np.float32)
     eye = None if eye_m is None else np.array(eye_m)
-    plane = _support_plane(np.zeros((30, 3)), others, TrackObjects(), np.array(up, float), eye)
+    plane = Support().plane(np.zeros((30, 3)), others, np.array(up, float), eye)
     np.testing.assert_allclose(plane, [0, 0, 1, 0], atol=0.01)
 
 
