@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,8 @@ FLASH_S = 0.3
 """Minimum time in seconds for which a second hand must be visible."""
 HOLD_S = 0.5
 """Time in seconds for which the silhouette of a lost hand is kept."""
+GAP_S = 1.5
+"""Longest gap in seconds in which the silhouette moves from one detection to the next."""
 Run = Callable[[Record, Estimators, AnnotateConfig], Record]
 
 
@@ -196,9 +199,10 @@ def _without(hands: HandTracks, dropped: Bool[np.ndarray, "f 2"]) -> HandTracks:
 
 
 def hold_hands(hands: HandTracks, fps: Fraction) -> HandTracks:
-    """Return tracks in which a lost hand keeps its nearest detection in time for 0.5 s.
+    """Return tracks in which a hand moves straight through a gap of at most 1.5 s.
 
-    For silhouettes only: a hand that enters, leaves or is lost for a moment must not become part of
+    In other frames, a lost hand keeps its nearest detection in time for 0.5 s. For silhouettes
+    only: a hand that enters, leaves or is lost for a moment must not become part of
     the scene.
     """
     joints_px, joints_hand_m = hands.joints_px.copy(), hands.joints_hand_m.copy()
@@ -210,6 +214,12 @@ def hold_hands(hands: HandTracks, fps: Fraction) -> HandTracks:
             near = np.abs(nearest - frames) <= HOLD_S * fps
             joints_px[near, side] = hands.joints_px[nearest[near], side]
             joints_hand_m[near, side] = hands.joints_hand_m[nearest[near], side]
+            for start, stop in pairwise(known.tolist()):
+                if 1 < stop - start <= GAP_S * fps:
+                    share = np.linspace(0, 1, stop - start + 1)[:, None, None]
+                    for joints in (joints_px, joints_hand_m):
+                        first, last = joints[start, side], joints[stop, side]
+                        joints[start : stop + 1, side] = first + share * (last - first)
     return replace(hands, joints_px=joints_px, joints_hand_m=joints_hand_m)
 
 

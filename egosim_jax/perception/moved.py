@@ -40,6 +40,8 @@ START_MOTION = 0.05
 """Displacement of an object up to which it begins to move, in image widths."""
 MIN_CORNERS = 6
 """Minimum number of corners of an object, and of an object that is found again in a frame."""
+MAX_SHARE = 0.5
+"""Largest share of the first frame that an object covers: what covers more is the scene."""
 MAX_HAND_DISTANCE = 1.5
 """Maximum distance of a moved corner from the hand's nearest joint, in hand sizes."""
 MAX_HAND_DIFFERENCE = 0.6
@@ -145,7 +147,7 @@ def _find_moved(
         column, row = np.rint(tracks.start).astype(int).T
         passed = grown(np.asarray(shown.any(axis=0)), 3)  # an object that passes drags corners
         held &= ~passed[row, column]
-        if first.sum() >= MIN_CORNERS**2:
+        if first.sum() >= MIN_CORNERS**2 and first.mean() <= MAX_SHARE:
             worn = _touches_border(first) and bool((first & grown(hidden[0], 5)).any())
             contacts = _contacts(start, motion, hands, width)
             found.append(

@@ -1,13 +1,15 @@
 """Silhouettes of hands and forearms, drawn from their joints.
 
-A hand consists of capsules around its bones, the palm between its knuckles, and a forearm from the
-wrist towards the wearer. Without a segmentation network, this is the mask of the wearer's moving
-pixels. A wide sleeve is wider than the drawn forearm.
+A hand consists of capsules around its bones, the palm between its knuckles, and an arm from the
+wrist towards the wearer. The forearm of a tracked hand also continues the palm. Without a
+segmentation network, this is the mask of the wearer's moving pixels. A wide sleeve is wider than
+the drawn forearm.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float, Int32, UInt8
@@ -38,7 +40,13 @@ class HandShape:
     shoulder_offset_m: tuple[float, float, float] = (0.0, 0.35, 0.05)
     """Origin of an arm in camera axes in meters; its x is an offset from the wrist."""
     arm_fraction: float = 0.8
-    """Drawn fraction of the way from the wrist to the arm's origin."""
+    """Drawn fraction of the way from the wrist, or the elbow, to the arm's origin."""
+    forearm_m: float | None = None
+    """Length of a forearm that continues the palm; None: the arm is straight from the wrist on."""
+    bend: float = 1.0
+    """Weight of the direction to the arm's origin in a forearm's direction; the palm's has 1."""
+    sides_m: tuple[float, float] | None = None
+    """x of the origins of a left and a right arm, for hands in this order; None: the wrist's."""
     near_m: float = 0.05
     """Near limit of drawing, in meters from the camera."""
     discs: int = 25
@@ -47,6 +55,10 @@ class HandShape:
     def __post_init__(self) -> None:
         """Check that a capsule has at least one disc."""
         check_counts({"discs": self.discs})
+
+
+TRACKED = HandShape(arm_radius_m=0.06, forearm_m=0.26, sides_m=(-0.2, 0.2))
+"""Size of the hands of a video, whose arms may have sleeves."""
 
 
 def track_silhouettes(
@@ -66,7 +78,7 @@ def track_silhouettes(
         width=width,
     )
     joints_m = lift(tracks, cameras.intrinsics_px)
-    return hand_silhouette(joints_m, "human", cameras, HandShape()) >= 0
+    return hand_silhouette(joints_m, "human", cameras, TRACKED) >= 0
 
 
 def hand_silhouette(
@@ -87,19 +99,37 @@ def hand_silhouette(
                 continue
             joints = transform(invert(world_from_camera), hand)
             palm = joints[PALM[kind]]
-            shoulder = np.array(shape.shoulder_offset_m) + [palm[0, 0], 0, 0]
-            elbow = palm[0] + shape.arm_fraction * (shoulder - palm[0])
+            arm = _arm(palm, number, shape)
             canvas[:] = 0
             for start, end in bones:
                 radius_m = shape.finger_radius_m
                 draw_capsule(canvas, joints[start], joints[end], radius_m, cameras, shape)
-            draw_capsule(canvas, palm[0], elbow, shape.arm_radius_m, cameras, shape)
+            for start, end in pairwise(arm):
+                draw_capsule(canvas, start, end, shape.arm_radius_m, cameras, shape)
             if (palm[:, 2] > shape.near_m).all():
                 u, v = project(cameras.intrinsics_px, palm)
                 corners = np.rint(np.stack([u, v], axis=1)).astype(np.int32)
                 cv2.fillConvexPoly(canvas, cv2.convexHull(corners), 1)
             covered[frame][canvas > 0] = number
     return covered
+
+
+def _arm(
+    palm: Float[np.ndarray, "k 3"], number: int, shape: HandShape
+) -> list[Float[np.ndarray, " 3"]]:
+    """Return the points of an arm in camera axes: wrist, elbow if it has one, and its end."""
+    arm = [palm[0]]
+    sides = shape.sides_m
+    across = palm[0, 0] if sides is None else sides[number]
+    origin = np.array(shape.shoulder_offset_m) + [across, 0, 0]
+    if shape.forearm_m is not None:
+        along = _unit(palm[0] - palm[1:].mean(axis=0)) + shape.bend * _unit(origin - palm[0])
+        arm.append(palm[0] + shape.forearm_m * _unit(along))
+    return [*arm, arm[-1] + shape.arm_fraction * (origin - arm[-1])]
+
+
+def _unit(vector: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+    return vector / max(float(np.linalg.norm(vector)), 1e-9)
 
 
 def draw_capsule(

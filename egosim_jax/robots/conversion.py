@@ -91,6 +91,7 @@ def convert(
     episode = source.episode
     joints = _path([action.joints_m for action in episode.actions])
     poses = _path([action.cameras.world_from_camera for action in episode.actions])
+    cameras = replace(episode.actions[0].cameras, world_from_camera=poses)
     chosen = _hands(joints, hands)
     backgrounds = _backgrounds(source)
     if base is not None and len(chosen) > 1:
@@ -103,7 +104,7 @@ def convert(
             robot,
             grips,
             world_from_up=world_from_up,
-            world_from_camera=poses,
+            cameras=cameras,
             fps=episode.fps,
             base=base,
         )

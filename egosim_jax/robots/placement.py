@@ -10,10 +10,11 @@ from typing import Any, no_type_check
 import numpy as np
 from jaxtyping import Bool, Float
 
-from egosim_jax.geometry import invert, transform
+from egosim_jax.geometry import invert, pixel_rays, transform
 from egosim_jax.robots.ik import REACHED_M, Solver, Track
 from egosim_jax.robots.models import TABLE, RobotModel, grip_of
 from egosim_jax.robots.retarget import Grips
+from egosim_jax.types import Cameras
 
 ANGLES = np.radians([0, 30, -30, 60, -60, 90, -90, 135, -135, 180])
 """Directions of the base as seen from the path, from the wearer's, in order of preference."""
@@ -29,8 +30,14 @@ GOOD_TURN = np.radians(15)
 """Direction error up to which a base is taken at once."""
 EYE_M = 0.12
 """Least distance of the arm's links in front of the camera from it."""
+FAR_M = 10.0
+"""Distance from the camera within which an arm covers the image."""
 WRIST_M = 0.1
 """Distance from the gripper's wrist within which a link does not hide it."""
+COVER, COVER_COST = 0.2, 3.0
+"""Share of the image that an arm may cover, and cost of the rest, in radians of direction error."""
+VIEW = 9, 7
+"""Numbers of columns and rows of the image at which it is tested what the arm covers."""
 BAD = 10.0
 """Cost of a moment that is not reached or not seen, in radians of direction error."""
 MAX_TRACKS, ENOUGH = 4, 0.99
@@ -57,30 +64,33 @@ def place(
     grips: Grips,
     *,
     world_from_up: Float[np.ndarray, "4 4"],
-    world_from_camera: Float[np.ndarray, "f 4 4"],
+    cameras: Cameras,
     fps: int,
     base: Base | None = None,
 ) -> Placed:
     """Return the base from which the arm reaches most of the path, clear of the camera.
 
-    `world_from_up` is a frame on the table, z upwards. By default, `base` is searched.
+    `cameras` has a camera for each grip. `world_from_up` is a frame on the table, z upwards. By
+    default, `base` is searched.
     """
     up_from_grip = invert(world_from_up) @ grips.world_from_grip
-    cameras = invert(world_from_up) @ world_from_camera
-    moments = np.unique(np.linspace(0, len(cameras) - 1, MOMENTS).astype(int))
+    view = _view(cameras)
+    eyes = invert(world_from_up) @ cameras.world_from_camera
+    moments = np.unique(np.linspace(0, len(eyes) - 1, MOMENTS).astype(int))
     facing = _facing(robot)
     bases = (
         [_base(base[:3], np.radians(base[3]))]
         if base
-        else _candidates(robot, up_from_grip[:, :3, 3], cameras[:, :3, 3], facing)
+        else _candidates(robot, up_from_grip[:, :3, 3], eyes[:, :3, 3], facing)
     )
     tried = []
     for up_from_base in bases:
         solver = Solver(robot, table_m=-up_from_base[2, 3])
         for flip in (np.eye(4), FLIP):
             path = invert(up_from_base) @ up_from_grip @ flip
-            local = invert(up_from_base) @ cameras
-            cost, start = _try(solver, path[moments], grips.opening_m[moments], local[moments])
+            local = invert(up_from_base) @ eyes
+            openings = grips.opening_m[moments]
+            cost, start = _try(solver, path[moments], openings, local[moments], view)
             tried.append((cost, len(tried), up_from_base, path, start))
         if min(t[0] for t in tried[-2:]) < GOOD_TURN:
             break
@@ -89,7 +99,7 @@ def place(
     for _, _, up_from_base, path, start in tried[:MAX_TRACKS]:
         solver = Solver(robot, table_m=-up_from_base[2, 3])
         track = solver.follow(start, path, grips.opening_m, fps=fps)
-        clear = _clear(solver, track, invert(up_from_base) @ cameras)
+        clear = _clear(solver, track, invert(up_from_base) @ eyes)
         found.append(Placed(world_from_base=world_from_up @ up_from_base, track=track, clear=clear))
         if track.reached[grips.seen].mean() >= ENOUGH and clear.mean() >= ENOUGH:
             break
@@ -119,12 +129,13 @@ def _clear(solver: Solver, track: Track, cameras: np.ndarray) -> Bool[np.ndarray
 
 
 def _try(
-    solver: Solver, path: np.ndarray, openings: np.ndarray, cameras: np.ndarray
+    solver: Solver, path: np.ndarray, openings: np.ndarray, cameras: np.ndarray, view: np.ndarray
 ) -> tuple[float, np.ndarray]:
     """Return the cost of a base, and the posture at the first moment.
 
-    The cost is the mean direction error in radians, and `BAD` for each moment that is not reached,
-    and for each in which the arm is close in front of the camera or hides the gripper from it.
+    The cost is the mean direction error in radians, more for an arm that covers much of the image,
+    and `BAD` for each moment that is not reached, and for each in which the arm is close in front
+    of the camera or hides the gripper from it.
     """
     mujoco: Any = import_module("mujoco")
 
@@ -144,7 +155,31 @@ def _try(
         links = transform(invert(camera), data.xpos[1:])
         near = bool(((links[:, 2] > 0) & (np.linalg.norm(links, axis=1) < EYE_M)).any())
         cost += float(turn) + BAD * (miss + (near or _hides(solver, data, camera[:3, 3])))
+        cost += COVER_COST * max(0.0, _covered(solver, data, camera, view) - COVER)
     return cost / len(path), start
+
+
+def _view(cameras: Cameras) -> Float[np.ndarray, "n 3"]:
+    """Return directions through a grid of the image, of length 1, in camera axes."""
+    rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
+    columns, rows = (
+        ((np.arange(count) + 0.5) * size / count).astype(int)
+        for count, size in zip(VIEW, (cameras.width, cameras.height), strict=True)
+    )
+    some = rays[rows][:, columns].reshape(-1, 3)
+    return some / np.linalg.norm(some, axis=1, keepdims=True)
+
+
+def _covered(solver: Solver, data: Any, camera: np.ndarray, view: np.ndarray) -> float:
+    """Return the share of the image's directions in which the arm is."""
+    mujoco: Any = import_module("mujoco")
+
+    mj, rays = solver.robot.mj, (view @ camera[:3, :3].T).ravel()
+    hits, distances = np.zeros(len(view), np.int32), np.zeros(len(view))
+    mujoco.mj_multiRay(
+        mj, data, camera[:3, 3], rays, None, True, -1, hits, distances, None, len(view), FAR_M
+    )
+    return float(((hits >= 0) & (hits != mj.geom(TABLE).id)).mean())
 
 
 def _hides(solver: Solver, data: Any, eye: np.ndarray) -> bool:

@@ -55,6 +55,24 @@ def test_a_hand_keeps_its_silhouette_for_half_a_second():
     assert not visible(held)[:, 1 - RIGHT].any()
 
 
+@pytest.mark.parametrize("gap", [24, 25])
+def test_a_silhouette_moves_through_a_gap_of_up_to_a_second_and_a_half(gap):
+    hands = StubHands(1.0, None)(np.zeros((60, 48, 80, 3), np.uint8))
+    pixels = hands.joints_px.copy()
+    pixels[10 + gap :] += [6, 0]
+    missing = slice(11, 10 + gap)
+    pixels[missing] = np.nan
+    presence = hands.presence.copy()
+    presence[missing] = 0
+    lost = replace(hands, joints_px=pixels, presence=presence)
+    held = hold_hands(lost, Fraction(16))
+    halfway = held.joints_px[10 + gap // 2, RIGHT] - pixels[10, RIGHT]
+    if gap == 24:
+        np.testing.assert_allclose(halfway, np.full((21, 2), [3, 0]), atol=1e-9)
+    else:
+        assert np.isnan(halfway).all()
+
+
 def test_a_video_without_hands_holds_none():
     hands = StubHands(0.0, None)(np.zeros((9, 48, 80, 3), np.uint8))
     assert not visible(hold_hands(hands, Fraction(16))).any()

@@ -8,8 +8,9 @@ pytest.importorskip("mink")
 from egosim_jax.geometry import look_at
 from egosim_jax.robots.ik import Solver
 from egosim_jax.robots.models import GRIP
-from egosim_jax.robots.placement import place
+from egosim_jax.robots.placement import _covered, _view, place
 from egosim_jax.robots.retarget import grips_of
+from egosim_jax.types import Cameras
 from tests.unit.robots.toy import TOY, make_toy
 
 FPS, FRAMES = 8, 9
@@ -37,6 +38,12 @@ def path_to(*places_m):
 def watch(eye_m, target_m):
     """Return the pose of a camera that looks at a place."""
     return look_at(eye_m, np.asarray(target_m), up=np.array([0.0, 0.0, 1.0]))
+
+
+def seen_by(poses, focal_px=60.0):
+    """Return cameras of images of 80 x 48 pixels."""
+    lens = np.array([[focal_px, 0, 39.5], [0, focal_px, 23.5], [0, 0, 1.0]])
+    return Cameras(world_from_camera=poses, intrinsics_px=lens, height=48, width=80)
 
 
 def gripper(poses, opening_m):
@@ -123,7 +130,7 @@ def test_a_base_is_found_from_which_the_whole_path_is_reached(toy):
     poses = path_to([0.1, 0.3, 0.15], [-0.1, 0.3, 0.05], [0.0, 0.2, 0.15])
     grips = grips_of(gripper(poses, 0.06), fps=FPS)
     cameras = np.repeat(watch(EYE, [0.0, 0.3, 0.1])[None], FRAMES, axis=0)
-    view = {"world_from_up": np.eye(4), "world_from_camera": cameras, "fps": FPS}
+    view = {"world_from_up": np.eye(4), "cameras": seen_by(cameras), "fps": FPS}
     placed = place(toy, grips, **view)
     assert placed.track.reached.all()
     assert placed.clear.all()
@@ -141,6 +148,30 @@ def test_frames_in_which_the_arm_is_close_in_front_of_the_camera_are_known(toy):
     cameras[5] = watch(jaws, jaws + [0, 0.1, 1])  # from between the jaws into the hand
     cameras[7] = watch(jaws, jaws + [0, 1, 0])  # the arm is above and behind this one
     base = (0.0, -0.1, 0.0, 90.0)
-    view = {"world_from_up": np.eye(4), "world_from_camera": cameras, "fps": FPS}
+    view = {"world_from_up": np.eye(4), "cameras": seen_by(cameras), "fps": FPS}
     placed = place(toy, grips, base=base, **view)
     np.testing.assert_array_equal(np.flatnonzero(~placed.clear), [5])
+
+
+def test_a_base_from_which_the_arm_covers_less_of_the_image_is_preferred(toy, monkeypatch):
+    poses = path_to([0.05, 0.3, 0.1], [-0.05, 0.3, 0.1])
+    grips = grips_of(gripper(poses, 0.06), fps=FPS)
+    eyes = np.repeat(watch(np.array([0.0, -0.3, 0.4]), [0.0, 0.2, 0.1])[None], FRAMES, axis=0)
+    given = {"world_from_up": np.eye(4), "cameras": seen_by(eyes, focal_px=80.0), "fps": FPS}
+
+    mujoco = pytest.importorskip("mujoco")
+
+    def share(placed):
+        data = mujoco.MjData(toy.mj)
+        data.qpos[:] = placed.track.q[0]
+        mujoco.mj_kinematics(toy.mj, data)
+        camera = np.linalg.inv(placed.world_from_base) @ eyes[0]
+        return _covered(Solver(toy, table_m=0.0), data, camera, _view(given["cameras"]))
+
+    monkeypatch.setattr("egosim_jax.robots.placement.COVER", 0.0)
+    monkeypatch.setattr("egosim_jax.robots.placement.COVER_COST", 0.0)
+    anywhere = share(place(toy, grips, **given))
+    monkeypatch.setattr("egosim_jax.robots.placement.COVER_COST", 100.0)
+    chosen = place(toy, grips, **given)
+    assert 0 < share(chosen) < anywhere
+    assert chosen.track.reached.all()
