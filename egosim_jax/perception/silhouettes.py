@@ -57,8 +57,8 @@ class HandShape:
         check_counts({"discs": self.discs})
 
 
-TRACKED = HandShape(arm_radius_m=0.06, forearm_m=0.26, sides_m=(-0.2, 0.2))
-"""Size of the hands of a video, whose arms may have sleeves."""
+TRACKED = HandShape(forearm_m=0.26, sides_m=(-0.2, 0.2))
+"""Size of the tracked hands of a video."""
 
 
 def track_silhouettes(
