@@ -80,6 +80,7 @@ def test_a_single_process_reads_the_next_record_instead_of_a_bad_one(points, alo
         np.testing.assert_array_equal(source[int(record)].arrays["x"], x)
 
 
+@pytest.mark.slow
 def test_two_processes_with_any_rows_train_as_one_and_resume_its_run(points, alone, tmp_path):
     cases = [
         Case("fsdp", points),
