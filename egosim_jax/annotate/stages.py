@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -202,11 +201,13 @@ def hold_hands(hands: HandTracks, fps: Fraction) -> HandTracks:
     """Return tracks in which a hand moves straight through a gap of at most 1.5 s.
 
     In other frames, a lost hand keeps its nearest detection in time for 0.5 s. For silhouettes
-    only: a hand that enters, leaves or is lost for a moment must not become part of
-    the scene.
+    only: a hand that enters, leaves or is lost for a moment must not become part of the scene.
     """
+    from egosim_jax.perception.hands.track import fill_gaps, runs
+
     joints_px, joints_hand_m = hands.joints_px.copy(), hands.joints_hand_m.copy()
     found, frames = visible(hands), np.arange(len(hands.presence))
+    gaps = np.zeros_like(found)
     for side in (LEFT, RIGHT):
         known = np.flatnonzero(found[:, side])
         if len(known):
@@ -214,12 +215,10 @@ def hold_hands(hands: HandTracks, fps: Fraction) -> HandTracks:
             near = np.abs(nearest - frames) <= HOLD_S * fps
             joints_px[near, side] = hands.joints_px[nearest[near], side]
             joints_hand_m[near, side] = hands.joints_hand_m[nearest[near], side]
-            for start, stop in pairwise(known.tolist()):
-                if 1 < stop - start <= GAP_S * fps:
-                    share = np.linspace(0, 1, stop - start + 1)[:, None, None]
-                    for joints in (joints_px, joints_hand_m):
-                        first, last = joints[start, side], joints[stop, side]
-                        joints[start : stop + 1, side] = first + share * (last - first)
+        for start, stop in runs(~found[:, side]):
+            within = start > 0 and stop < len(found)
+            gaps[start:stop, side] = within and stop + 1 - start <= GAP_S * fps
+    joints_px, joints_hand_m = (fill_gaps(joints, gaps) for joints in (joints_px, joints_hand_m))
     return replace(hands, joints_px=joints_px, joints_hand_m=joints_hand_m)
 
 

@@ -116,7 +116,7 @@ def to_latex(evaluation: Evaluation) -> str:
             for title, row in evaluation.table(group).items()
         ]
         body = " \\\\\n".join([" & ".join(["method", *heads]), *rows])
-        caption = f"{evaluation.caption(group)}, mean ± spread. {' '.join(evaluation.notes()[1:3])}"
+        caption = f"{evaluation.caption(group)}, mean ± spread. {' '.join(evaluation.notes()[:2])}"
         tables.append(
             "\\begin{table}\n\\centering\n"
             f"\\begin{{tabular}}{{l{'r' * len(headings)}}}\n\\hline\n{body} \\\\\n\\hline\n"

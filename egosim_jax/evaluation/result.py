@@ -244,10 +244,10 @@ class Evaluation:
         sizes = ", ".join(protocol["pixels"])
         frames = f"frames {self.protocol.first} to {last}"
         lines = [
-            "reading: an interval without 0 shows a difference; a model that is no better than the "
-            "baselines (prior, first frame repeated) does no better than copying",
             f"{frames} at the size of the {protocol['size']}: {sizes}",
             f"protocol: {protocol['description']}",
+            "reading: an interval without 0 shows a difference; a model that is no better than the "
+            "baselines (prior, first frame repeated) does no better than copying",
         ]
         lines += [
             f"{key}: {text}"

@@ -113,18 +113,13 @@ def _clear(solver: Solver, track: Track, cameras: np.ndarray) -> Bool[np.ndarray
     mujoco: Any = import_module("mujoco")
 
     mj, clear = solver.robot.mj, []
-    data, table = mujoco.MjData(mj), mj.geom(TABLE).id
+    data = mujoco.MjData(mj)
     rays = np.array([(*across, 1.0) for across in product((-1.0, 0.0, 1.0), repeat=2)])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    hits, distances = np.zeros(len(rays), np.int32), np.zeros(len(rays))
     for q, opening, camera in zip(track.q, track.opening_m, cameras, strict=True):
-        eye, toward = camera[:3, 3], (rays @ camera[:3, :3].T).ravel()
         data.qpos[:] = solver.robot.open(q, float(opening))
         mujoco.mj_kinematics(mj, data)
-        mujoco.mj_multiRay(
-            mj, data, eye, toward, None, True, -1, hits, distances, None, len(rays), EYE_M
-        )
-        clear.append(not ((hits >= 0) & (hits != table) & (distances < EYE_M)).any())
+        clear.append(not _meets(solver, data, camera, rays, EYE_M).any())
     return np.array(clear)
 
 
@@ -172,14 +167,21 @@ def _view(cameras: Cameras) -> Float[np.ndarray, "n 3"]:
 
 def _covered(solver: Solver, data: Any, camera: np.ndarray, view: np.ndarray) -> float:
     """Return the share of the image's directions in which the arm is."""
+    return float(_meets(solver, data, camera, view, FAR_M).mean())
+
+
+def _meets(
+    solver: Solver, data: Any, camera: np.ndarray, rays: np.ndarray, within_m: float
+) -> Bool[np.ndarray, " n"]:
+    """Return which directions from the camera, in its axes, meet the arm within a distance."""
     mujoco: Any = import_module("mujoco")
 
-    mj, rays = solver.robot.mj, (view @ camera[:3, :3].T).ravel()
-    hits, distances = np.zeros(len(view), np.int32), np.zeros(len(view))
+    mj, toward = solver.robot.mj, (rays @ camera[:3, :3].T).ravel()
+    hits, distances = np.zeros(len(rays), np.int32), np.zeros(len(rays))
     mujoco.mj_multiRay(
-        mj, data, camera[:3, 3], rays, None, True, -1, hits, distances, None, len(view), FAR_M
+        mj, data, camera[:3, 3], toward, None, True, -1, hits, distances, None, len(rays), within_m
     )
-    return float(((hits >= 0) & (hits != mj.geom(TABLE).id)).mean())
+    return (hits >= 0) & (hits != mj.geom(TABLE).id) & (distances < within_m)
 
 
 def _hides(solver: Solver, data: Any, eye: np.ndarray) -> bool:
