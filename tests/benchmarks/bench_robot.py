@@ -4,9 +4,10 @@
         [--out FOLDER]
 
 For each scene: the share of frames that the robot reaches, its largest distance from the pinch
-point, its distance from the table, and its speed relative to the limits; the share of the objects'
-pixels where the robot is in front or behind as in the ray-cast scene; the largest distance between
-the grip in the LeRobot dataset and the grip that MuJoCo gives for the dataset's joint positions;
+point, its direction error (median and largest), its distance from the table and between its links,
+and its speed relative to the limits; the share of the objects' pixels where the robot is in front
+or behind as in the ray-cast scene; the largest distance between the grip in the LeRobot dataset and
+the grip that MuJoCo gives for the dataset's joint positions;
 the sources of the pixels behind hands; and the seconds of conversion and dataset (clock and CPU),
 without the making of the scene. The last line has the peak memory of the process. FOLDER keeps the
 datasets, for example for `lerobot-doctor check` and `lelint check`.
@@ -105,9 +106,12 @@ def main() -> None:
             replayed = replay_error(found, folder)
         report = report_of(found)
         (entry,) = report["robots"]
+        turn = entry["turn_error_degrees"]
         print(
             f"{seed}: reached {entry['reached']:.1%}, {1e3 * entry['pinch_error_m']['max']:.1f} mm "
-            f"off, table {1e3 * entry['least_distance_from_table_m']:.1f} mm, speed "
+            f"off, turned {turn['median']:.1f} and {turn['max']:.1f} degrees, "
+            f"table {1e3 * entry['least_distance_from_table_m']:.1f} mm, "
+            f"links {1e3 * entry['least_distance_of_links_m']:.1f} mm, speed "
             f"{entry['speed_in_limits']:.2f}, order {depth_order(found, script):.2%}, replay "
             f"{1e3 * replayed:.4f} mm, {report['hand_pixels']}, {seconds[0]:.1f} s, "
             f"{seconds[1]:.1f} s of CPU",
