@@ -77,7 +77,15 @@ def read_latents(
 
 
 def make_latents(
-    model: ModelConfig, weights: Path, out: Path, *, first: int, stride: int, scenes: int
+    model: ModelConfig,
+    weights: Path,
+    out: Path,
+    *,
+    first: int,
+    stride: int,
+    scenes: int,
+    clips: int = 2,
+    fused: float = 0.0,
 ) -> Iterator[int]:
     """Write the shards of `scenes` scenes; yield the number of clips after each shard."""
     from egosim_jax.io.weights import load
@@ -86,7 +94,7 @@ def make_latents(
     vae = abstract(model.vae)
     load(weights / "vae.safetensors", vae)
     encode = partial(make_encode(model, vae), nnx.state(vae))
-    source = EndlessScenes(model=model)
+    source = EndlessScenes(model=model, clips=clips, fused=fused)
     out.mkdir(parents=True, exist_ok=True)
     raw: list[Mapping[str, np.ndarray]] = []
     encoded: list[Mapping[str, np.ndarray]] = []
@@ -113,6 +121,10 @@ def main(args: Sequence[str] | None = None) -> None:
     parser.add_argument("--first", type=int, required=True, help="first seed")
     parser.add_argument("--stride", type=int, default=1, help="distance of two seeds")
     parser.add_argument("--scenes", type=int, default=10**9, help="number of scenes")
+    parser.add_argument("--clips", type=int, default=2, help="clips of a scene")
+    parser.add_argument(
+        "--fused", type=float, default=0.0, help="fraction of scenes with fused states (Open3D)"
+    )
     options = parser.parse_args(args)
     weights = options.weights or configs.shipped_weights(options.config)
     if weights is None:
@@ -125,6 +137,8 @@ def main(args: Sequence[str] | None = None) -> None:
         first=options.first,
         stride=options.stride,
         scenes=options.scenes,
+        clips=options.clips,
+        fused=options.fused,
     ):
         pace = (time.monotonic() - began) / made
         print(f"{made} clips, {pace:.2f} s each", file=sys.stderr, flush=True)

@@ -8,8 +8,7 @@ from typing import Any
 
 from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.configs.model import ModelConfig
-from egosim_jax.diffusion.objective import Objective
-from egosim_jax.train.tasks.denoising import Denoising
+from egosim_jax.train.tasks.few_steps import FewSteps
 from egosim_jax.train.tasks.refining import Refining
 from egosim_jax.types import InputError, check_counts
 
@@ -87,16 +86,10 @@ class OnlineTraining:
         return dit.layers
 
     @property
-    def denoising(self) -> Denoising:
+    def denoising(self) -> FewSteps:
         """Task of the denoiser."""
         dropout = ConditionDropout(prior=0.05, mask=0.05, hands=0.05, text=0.05)
-        steps = self.model.steps
-        return Denoising(
-            model=self.model,
-            objective=Objective(sampler_steps=steps if isinstance(steps, int) else None),
-            dropout=dropout,
-            change_loss_weight=4.0,
-        )
+        return FewSteps(model=self.model, dropout=dropout, change_loss_weight=4.0)
 
     @property
     def refining(self) -> Refining:

@@ -24,14 +24,18 @@ import numpy as np
 from egosim_jax import configs
 from egosim_jax.configs.model import ModelConfig
 from egosim_jax.generation.encoding import pack
-from egosim_jax.types import Triplet
+from egosim_jax.perception.oracle import OracleConfig
+from egosim_jax.state.fuse import fuse
+from egosim_jax.types import Clip, SceneState, Triplet
 from egosim_jax.worlds.tabletop import TabletopClip, make_scripts, make_sequence, state_after
 from egosim_jax.worlds.tabletop.attempts import make_attempts
-from egosim_jax.worlds.tabletop.clips import to_triplet
+from egosim_jax.worlds.tabletop.clips import to_action, to_ground_truth, to_triplet
 from egosim_jax.worlds.tabletop.idle import make_idle
 
 HELD_OUT = "held"
 """Prefix of the names of held-out clips in a queue."""
+FUSED_EVERY = 4
+"""Distance of the frames that are fused into a state."""
 MAX_QUEUED = 400
 """Number of files in a queue from which the processes wait."""
 
@@ -52,6 +56,9 @@ class EndlessScenes:
     """Fraction of scenes whose hands rest, are absent or wander."""
     wrong_prompts: float = 0.04
     """Fraction of clips with the prompt of another scene: the hands decide, not the prompt."""
+    fused: float = 0.0
+    """Fraction of scenes whose states are fused from the frames of the clips before, which needs
+    Open3D. In the other scenes the objects of the first state move, and no points are added."""
     black_cloths: int = 2
     """Maximum number of black cloths on a table, which look unobserved in a prior."""
 
@@ -78,10 +85,37 @@ class EndlessScenes:
 
     def triplets(self, seed: int) -> Iterator[Triplet]:
         """Yield the clips of a scene as triplets, each rendered from the state before it."""
+        fused = np.random.default_rng([seed, 12]).random() < self.fused
         state = None
         for clip in self.clips_of(seed):
             yield to_triplet(clip, state, point_px=self.model.point_px)
-            state = state_after(clip, state or clip.state)
+            state = state or clip.state
+            if fused:
+                state = fused_after(clip, state, fps=self.model.video.fps)
+            else:
+                state = state_after(clip, state)
+
+
+def fused_after(clip: TabletopClip, state: SceneState, *, fps: int) -> SceneState:
+    """Fuse true frames of a clip into a state, with the true motion.
+
+    A simulator fuses all frames; every `FUSED_EVERY`-th costs a quarter of the time, and leaves the
+    same traces of objects, shadows and hands.
+    """
+    some = slice(None, None, FUSED_EVERY)
+    cameras = replace(clip.cameras, world_from_camera=clip.cameras.world_from_camera[some])
+    clip = replace(
+        clip,
+        cameras=cameras,
+        frames=clip.frames[some],
+        depth_m=clip.depth_m[some],
+        ids=clip.ids[some],
+        joints_m=clip.joints_m[some],
+        world_from_body={name: path[some] for name, path in clip.world_from_body.items()},
+    )
+    perceive = OracleConfig().build({state.step: to_ground_truth(clip)})
+    perceived = perceive(Clip(frames=clip.frames, fps=fps), to_action(clip), state)
+    return fuse(state, perceived)
 
 
 def row_of(triplet: Triplet, model: ModelConfig) -> dict[str, np.ndarray]:

@@ -120,12 +120,7 @@ class Denoising:
         self, networks: Any, batch: Batch, keys: Key[Array, "b 2"]
     ) -> tuple[jax.Array, Metrics]:
         """Return the diffusion loss of a batch under condition dropout."""
-        if self.model.posterior == "sampled":
-            batch = draw_latents(batch, keys[:, 1])
-        if self.navigation:
-            batch = without_hands(batch, keys[:, 0], self.navigation)
-        condition = condition_of(networks, batch, self.model)
-        condition = self.dropout.apply(condition, keys[:, 0])
+        batch, condition = self.conditioned(networks, batch, keys)
         process, target = self.model.process, batch["target"]
         denoise = denoising(self.model, networks, condition, target)
         weights = loss_weights(target, batch.get("prior", target), self.change_loss_weight)
@@ -134,6 +129,17 @@ class Denoising:
             process, denoise, target, keys[:, 1], loss_weights=weights, chunks=chunks
         )
         return loss, {}
+
+    def conditioned(
+        self, networks: Any, batch: Batch, keys: Key[Array, "b 2"]
+    ) -> tuple[Batch, Condition]:
+        """Return the batch as it is learned, and its condition after dropout."""
+        if self.model.posterior == "sampled":
+            batch = draw_latents(batch, keys[:, 1])
+        if self.navigation:
+            batch = without_hands(batch, keys[:, 0], self.navigation)
+        condition = condition_of(networks, batch, self.model)
+        return batch, self.dropout.apply(condition, keys[:, 0])
 
     def validate(self, networks: Networks, batch: Batch) -> Metrics:
         """Return each sample's errors at fixed noise levels, under the full condition.
