@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
 from egosim_jax.annotate.config import AnnotateConfig, Estimators
+from egosim_jax.annotate.hand_tracks import visible
 from egosim_jax.annotate.prepare import RefusedError
 from egosim_jax.annotate.record import Record
 from egosim_jax.annotate.stages import (
@@ -21,7 +22,6 @@ from egosim_jax.annotate.stages import (
     find_hands,
     joints_in_world,
     undistort_clip,
-    visible,
 )
 from egosim_jax.evaluation.metrics.image import decibels
 from egosim_jax.geometry import invert, pixel_rays, pixels_of, transform

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from egosim_jax.annotate.clip import Job, annotate
+from egosim_jax.annotate.hand_tracks import drop_flashes, hold_hands, visible
 from egosim_jax.annotate.scene import to_triplet
 from egosim_jax.annotate.sources import Source, open_source
-from egosim_jax.annotate.stages import drop_flashes, hold_hands, visible
 from egosim_jax.io.bounded import read_json
 from egosim_jax.perception.classical import ClassicalConfig
 from egosim_jax.perception.depth import SweptDepth

@@ -8,6 +8,7 @@ import pytest
 
 from egosim_jax.annotate.clip import Job, open_record
 from egosim_jax.annotate.frames import Sampling
+from egosim_jax.annotate.hand_tracks import drop_flashes, hold_hands, visible
 from egosim_jax.annotate.prepare import RefusedError
 from egosim_jax.annotate.scene import (
     STAGES,
@@ -19,13 +20,7 @@ from egosim_jax.annotate.scene import (
     to_triplet,
 )
 from egosim_jax.annotate.sources import Source, open_source
-from egosim_jax.annotate.stages import (
-    drop_flashes,
-    find_hands,
-    hold_hands,
-    search_hands,
-    visible,
-)
+from egosim_jax.annotate.stages import find_hands, search_hands
 from egosim_jax.perception.estimates import LEFT, RIGHT
 from egosim_jax.perception.moved import Moved
 from tests.unit.annotate.stubs import StubHands, config, textured_video, write
