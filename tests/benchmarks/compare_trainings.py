@@ -43,6 +43,7 @@ from egosim_jax.train.loop import make_batches, validation_batches
 from egosim_jax.train.recipes import TABLETOP, TABLETOP_VAE
 from egosim_jax.train.task import Stage
 from egosim_jax.train.tasks.denoising import Denoising
+from egosim_jax.train.tasks.few_steps import FewSteps
 from egosim_jax.train.update import Programs, TrainState, mean_validation
 from egosim_jax.types import InputError
 from tests.benchmarks.critic import Adversarial
@@ -108,9 +109,14 @@ DENOISERS: Mapping[str, Mapping[str, Any]] = {
         "change": 4.0,
         "times": "own steps",
     },
+    "bfloat16, change 4, own inputs": {
+        "dit": {"products": "bfloat16"},
+        "change": 4.0,
+        "task": FewSteps,
+    },
     "batch 4": {"batch": 4},
     "batch 16": {"batch": 16},
-    "routing": {"routing": True},
+    "routing": {"task": Routing},
     "wide": {"dit": {"dim": 384, "ffn_dim": 1152, "heads": 6}},
     "deep": {"dit": {"layers": 12}},
     "random": {"random": True},
@@ -118,7 +124,8 @@ DENOISERS: Mapping[str, Mapping[str, Any]] = {
 """Changes of the recipe `tabletop`; `wide`, `deep` and `random` start from random weights.
 
 `routing` leaves half of the tokens out of most blocks (`routing.py`); `own steps` trains at the
-noise levels that the sampler visits alone (`OwnSteps`)."""
+noise levels that the sampler visits alone (`OwnSteps`), `own inputs` at those, and on what the
+sampler has there (`few_steps.py`)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,7 +211,7 @@ def train_denoiser(settings: Settings, changes: Mapping[str, Any]) -> Trained:
         **changes.get("optimizer", {}),
     )
     training = replace(training, optimizer=optimizer, batch_size=changes.get("batch", 8))
-    kind = Routing if changes.get("routing") else Denoising
+    kind = changes.get("task", Denoising)
     times = changes.get("times", "uniform")
     own = OwnSteps(steps=settings.sampling_steps)
     task = kind(

@@ -59,6 +59,16 @@ def test_a_seed_gives_the_same_clips_and_every_kind_of_scene_occurs(tmp_path):
     np.testing.assert_array_equal(np.load(path)["target"], row["target"])
 
 
+def test_fused_states_have_what_the_frames_show_and_need_no_other_clips():
+    moved, fused = (
+        EndlessScenes(model=SMALL, fused=share, idle=0.0, attempts=0.0) for share in (0.0, 1.0)
+    )
+    one, other = (list(scenes.triplets(3)) for scenes in (moved, fused))
+    np.testing.assert_array_equal(one[0].prior, other[0].prior)
+    np.testing.assert_array_equal(one[1].target, other[1].target)
+    assert other[1].mask.sum() < one[1].mask.sum()  # places that the first clip showed
+
+
 def test_idle_hands_rest_are_absent_or_wander():
     kinds = set()
     for seed in range(12):

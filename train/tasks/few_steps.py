@@ -42,15 +42,15 @@ class FewSteps(Denoising):
     """Fraction of a batch with noisy targets at random times."""
 
     def __post_init__(self) -> None:
-        """Also raise `InputError` for students, predictions without a velocity, and fractions."""
+        """Also raise `InputError` for students, predictions without a velocity, and shares."""
         super().__post_init__()
         if self.model.chunks is not None or self.model.process.prediction not in ("velocity", "v"):
             raise InputError(
                 f"Training for a sampler's steps needs a model that denoises complete clips and "
                 f"predicts velocities, not {self.model.name}."
             )
-        if not 0 <= self.others <= 1:
-            raise InputError(f"others must be a fraction from 0 to 1, not {self.others}.")
+        if not 0 <= self.others < 1:
+            raise InputError(f"others must be at least 0 and below 1, not {self.others}.")
 
     def loss(
         self, networks: Any, batch: Batch, keys: Key[Array, "b 2"]
@@ -106,8 +106,8 @@ class FewSteps(Denoising):
             x = x[count:]
             rest = jax.tree.map(lambda array, start=start: array[start:], condition)
             denoise = denoising(self.model, frozen, rest, x)
-            now, then = times[number - 1], times[number]
-            output = denoise(x, process.timesteps(jnp.full(len(x), now, jnp.float32)))
+            now, then = jnp.asarray(times[number - 1 : number + 1], jnp.float32)
+            output = denoise(x, process.timesteps(jnp.full(len(x), now)))
             output = output.astype(jnp.float32)
             alpha, sigma = process.alpha(now), process.sigma(now)
             x0 = process.to_x0(x, output, alpha, sigma)
