@@ -3,10 +3,10 @@
     python -m tests.benchmarks.bench_rest [--scenes 12]
 
 Each scene has a fixed camera and is simulated twice, with the state of `classical`. Printed are the
-PSNR of each clip against the true world, that of the true clips through the autoencoder, which no
-denoiser exceeds, and how far the colors of the objects, which nothing
-touches, drift from the end of the first clip to the end of the last: the largest change of the mean
-of a channel over the pixels of an object, in 8-bit levels.
+PSNR of each clip against the true world, the PSNR of the targets through the autoencoder, which no
+denoiser exceeds, and how far the colors of the objects, which nothing touches, drift from the end
+of the first clip to the end of the last: the largest change of the mean of a channel over the
+pixels of an object, in 8-bit levels.
 """
 
 import numpy as np

@@ -57,8 +57,10 @@ class EndlessScenes:
     wrong_prompts: float = 0.04
     """Fraction of clips with the prompt of another scene: the hands decide, not the prompt."""
     fused: float = 0.0
-    """Fraction of scenes whose states are fused from the frames of the clips before, which needs
-    Open3D. In the other scenes the objects of the first state move, and no points are added."""
+    """Fraction of scenes whose states are fused from the frames of the clips before.
+
+    It needs Open3D. In the other scenes the objects of the first state move, and no points are
+    added."""
     black_cloths: int = 2
     """Maximum number of black cloths on a table, which look unobserved in a prior."""
 

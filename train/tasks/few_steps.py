@@ -1,7 +1,7 @@
 """Training of a denoiser for the few steps that its sampler takes.
 
 A sampler of few steps hands its network inputs that ordinary training never has: from the second
-step on, the network's own prediction stands where training has the noisy target. So most samples of
+step on, they contain the network's own prediction instead of the target. So most samples of
 a batch are inputs of the sampler here. With its times t_1 > ... > t_n, a sample of step k begins
 with noise and takes the k - 1 steps before it, without gradients:
 
@@ -55,7 +55,7 @@ class FewSteps(Denoising):
     def loss(
         self, networks: Any, batch: Batch, keys: Key[Array, "b 2"]
     ) -> tuple[jax.Array, Metrics]:
-        """Return the loss of a batch under condition dropout, and that of each step.
+        """Return the loss of a batch under condition dropout, and the loss of each step.
 
         A sample's step is its place in the batch, so the order of samples must be random.
         """
