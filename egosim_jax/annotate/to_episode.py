@@ -8,7 +8,7 @@ import numpy as np
 
 from egosim_jax.annotate.clip import ANNOTATION
 from egosim_jax.data.crop import Crop, plan_crop
-from egosim_jax.io.bounded import quote_path, read_json
+from egosim_jax.io.bounded import listing, quote_path, read_json
 from egosim_jax.io.images import read_image
 from egosim_jax.io.timing import Timeline
 from egosim_jax.io.untrusted.npz import read_arrays
@@ -25,6 +25,14 @@ def episode_from(folder: Path, video: VideoSpec, *, clips: int | None = None) ->
     ground-truth frames are the nearest in time, cropped to the model's size, and so are the first
     frame and the intrinsics. Raises `InputError` if the clip was refused or is too short.
     """
+    if not (folder / ANNOTATION).exists() and folder.parent.is_dir():
+        places = folder.glob(f"*/{ANNOTATION}"), folder.parent.glob(f"*/{ANNOTATION}")
+        known = sorted(str(path.parent) for found in places for path in found)
+        if known:
+            raise InputError(
+                f"{quote_path(folder)} is no clip of `egosim data annotate`. There are "
+                f"{listing(known)}."
+            )
     about = read_json(folder / ANNOTATION)
     row = about.get("row") if isinstance(about, dict) else None
     prompt = row.get("prompt") if isinstance(row, dict) else None

@@ -35,7 +35,7 @@ egosim --help describes all commands, egosim COMMAND --help one with its options
 """Page that `egosim` alone prints."""
 
 
-ANNOUNCED = ("simulate", "generate", "play", "serve", "train")
+ANNOUNCED = ("simulate", "generate", "evaluate", "play", "serve", "train", "data", "episode")
 """Subcommands that load for seconds, and so print a line before the first import."""
 
 

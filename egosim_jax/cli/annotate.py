@@ -14,7 +14,7 @@ from egosim_jax.perception.estimates import ChosenRung
 from egosim_jax.rendering import RendererName
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.runtime.progress import track
-from egosim_jax.runtime.terminal import printable
+from egosim_jax.runtime.terminal import counted, printable
 from egosim_jax.types import check_counts
 
 if TYPE_CHECKING:
@@ -143,8 +143,9 @@ class Annotate:
             for _ in track(self._annotate(jobs, config), "annotating", total=len(jobs)):
                 pass
             retries = run.choose_retries(scanned, self.out)
-            for _ in track(self._annotate(retries, config), "retrying", total=len(retries)):
-                pass
+            if retries:
+                for _ in track(self._annotate(retries, config), "retrying", total=len(retries)):
+                    pass
             report = run.write_report(scanned, self.out)
         return self._finish(report)
 
@@ -171,14 +172,14 @@ class Annotate:
         assumed = [found for found in cameras if found["focal_source"] == "assumed"]
         if assumed:
             print(
-                f"{len(assumed)} clips do not show their focal length: a view of 90 degrees is "
-                "assumed, so it is half of the video's longer side. Give it, in pixels of the "
-                "video, if you know it. (--focal)",
+                f"{counted(len(assumed), 'clip')} without a known focal length: a view of 90 "
+                "degrees is assumed, so it is half of the video's longer side. Give it, in pixels "
+                "of the video, if you know it. (--focal)",
                 file=sys.stderr,
             )
         print(
-            f"{counts['done']} clips done, {counts['refused']} refused, {counts['failed']} failed; "
-            f"see {self.out / 'index.html'}",
+            f"{counted(counts['done'], 'clip')} done, {counts['refused']} refused, "
+            f"{counts['failed']} failed; see {self.out / 'index.html'}",
             file=sys.stderr,
         )
         print(self.out)

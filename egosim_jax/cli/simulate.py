@@ -305,7 +305,9 @@ class _Outputs:
     def _print_step(self, step: Step, action: Action, *, seconds: float) -> None:
         about = f"clip {self.number}/{len(self.episode.actions)}: {action.prompt}"
         times = f"{seconds:.1f} s"
-        if step.latency is not None:
+        if not self.shown:
+            times = "made before"
+        elif step.latency is not None:
             first, last = step.latency.first_frame_s, step.latency.last_frame_s
             times += f"; first frame after {first:.1f} s, last after {last:.1f} s"
         print(printable(f"{about} ({times})"), file=sys.stderr)

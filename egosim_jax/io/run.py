@@ -151,9 +151,10 @@ def _compare(folder: Path, config: Any, mutable: Collection[str]) -> None:
         recorded = read_json(path)
         if not isinstance(recorded, dict):
             raise InputError(f"{path} is not a config. Restore it. (--out)")
-        differing = [
+        differences = _differences(recorded, wanted)
+        differing = [  # the short ones, such as a seed, before digests
             f"{field}: {difference}"
-            for field, difference in sorted(_differences(recorded, wanted).items())
+            for field, difference in sorted(differences.items(), key=lambda item: len(item[1]))
             if not any(f"{field}.".startswith(f"{free}.") for free in mutable)
         ]
         if differing:

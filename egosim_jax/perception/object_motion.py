@@ -172,7 +172,7 @@ def estimate_object_motion(
                 models.add(new)
                 note = f"moved something without an id: it is object {number} now"
             if note:
-                notes.append(f"hand {hand} {note}")
+                notes.append(f"{hand_name(action, hand)} {note}")
             if best is not None:
                 change, motion = best
                 state = models.state
@@ -209,6 +209,12 @@ def _closed_on(
             if faces is not None and encloses(faces, tips[-1]):
                 held[hand] = number
     return held
+
+
+def hand_name(action: Action, hand: int) -> str:
+    """Return how a note calls a hand of an action: by its number, if it is not the only one."""
+    one = "gripper" if action.kind == "robot" else "hand"
+    return f"the {one}" if action.joints_m.shape[1] == 1 else f"{one} {hand}"
 
 
 def _best_candidate(

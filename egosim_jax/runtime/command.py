@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import errno
+import io
 import logging
 import os
 import re
@@ -11,7 +12,7 @@ import select
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, redirect_stderr
 from dataclasses import MISSING, fields, is_dataclass, replace
 from enum import IntEnum
 from importlib import metadata
@@ -147,7 +148,8 @@ def _parse(commands: Any, args: Sequence[str], program: str, about: str) -> Comm
     if {"-h", "--help"} & {*args} or any(arg.startswith("--tyro-") for arg in args):
         return parse(commands, args, **whole)
     try:
-        return parse(commands, args, **whole, console_outputs=False)
+        with redirect_stderr(io.StringIO()):  # tyro prints values that it cannot read even so
+            return parse(commands, args, **whole, console_outputs=False)
     except SystemExit:
         if (chosen := _chosen(commands, args)) is not None:
             kind, depth = chosen

@@ -28,7 +28,9 @@ def ignore() -> None:
 
 def print_how_to_continue() -> None:
     """Print the command line that continues an interrupted run."""
-    print(f"interrupted; to continue: {shlex.join(sys.argv)}", file=sys.stderr, flush=True)
+    # `egosim train` is a program of two words (`cli/__main__.py`).
+    command = " ".join([sys.argv[0], *map(shlex.quote, sys.argv[1:])])
+    print(f"interrupted; to continue: {command}", file=sys.stderr, flush=True)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:

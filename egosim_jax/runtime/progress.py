@@ -9,7 +9,7 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
-PLAIN_SECONDS = 10.0
+PLAIN_SECONDS = 5.0
 """Minimum time between two plain lines, in seconds."""
 
 

@@ -25,3 +25,8 @@ def make_console(*, width: int | None = None) -> Console:
             return super().render_str(printable(text), **options)  # pyright: ignore
 
     return PlainConsole(width=width, markup=False, emoji=False, highlight=False)
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun: "1 clip", "2 clips"."""
+    return f"{number} {noun}{'s' * (number != 1)}"

@@ -150,10 +150,9 @@ class Episode:
     def load(cls, path: Path | str) -> Episode:
         """Read a folder or a .zip. Raises `InputError` if it is damaged or not valid."""
         path = Path(path)
+        data = None if path.is_dir() else read_bytes(path, limit=MAX_BYTES)  # names the path
         with _named(quote_path(path)):
-            if path.is_dir():
-                return _read(path)
-            return cls.from_bytes(read_bytes(path, limit=MAX_BYTES))
+            return _read(path) if data is None else cls.from_bytes(data)
 
     def to_bytes(self) -> bytes:
         """Return the byte format; equal episodes have equal bytes.

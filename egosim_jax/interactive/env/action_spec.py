@@ -25,6 +25,7 @@ from jaxtyping import Bool, Float
 
 from egosim_jax.io.bounded import quote
 from egosim_jax.rendering.mesh import Side
+from egosim_jax.runtime.terminal import counted
 from egosim_jax.simulation.actions import with_places
 from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, near_view
 from egosim_jax.worlds.tabletop.hands import joints_of
@@ -136,6 +137,23 @@ class ActionSpec:
             row += self._placed(hand, side).ravel().tolist() if keypoints else hand.tolist()
         return _inside(np.array([*row, *([0.0] * 6 if self.camera else [])]), *self.bounds)
 
+    def check_row(self, row: object) -> Float[np.ndarray, " d"]:
+        """Return one row as an array; raise `InputError` as `check` does."""
+        found = to_numbers(row)
+        if found.shape != (len(self.names),):
+            raise InputError(
+                f"The action has shape {found.shape}: a step takes one row of {self.about}, of "
+                f"shape ({len(self.names)},). Give several rows, one for each frame, to "
+                "env.unwrapped.chunk_step."
+            )
+        return self.check(found[None], max_rows=1)[0]
+
+    @property
+    def about(self) -> str:
+        """Words for what a row has."""
+        camera = "and the camera" if self.camera else "without a camera"
+        return f"{self.layout} of {counted(len(self.sides), 'hand')} {camera}"
+
     def check(self, rows: object, *, max_rows: int) -> Float[np.ndarray, "k d"]:
         """Return 1 to `max_rows` rows as an array.
 
@@ -144,9 +162,8 @@ class ActionSpec:
         found = to_numbers(rows)
         if found.ndim != 2 or not 1 <= len(found) <= max_rows or found.shape[1] != len(self.names):
             raise InputError(
-                f"The actions have shape {found.shape}: {self.layout} of {len(self.sides)} hands "
-                f"{'and the camera' if self.camera else 'without a camera'} must be (1 to "
-                f"{max_rows}, {len(self.names)})."
+                f"The actions have shape {found.shape}: {self.about} must have 1 to {max_rows} "
+                f"rows of {len(self.names)} numbers."
             )
         finite = np.isfinite(found)
         if not finite.all():

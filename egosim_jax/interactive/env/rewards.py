@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, no_type_check, runtime_checkable
+from typing import Any, Protocol, no_type_check, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -77,6 +77,15 @@ def check_reward(reward: RewardFn, start: Start) -> None:
     """Run the check of a reward function that has one."""
     if isinstance(reward, StartChecker):
         reward.check(start)
+
+
+def check_callable(reward: Any) -> None:
+    """Raise `InputError` unless a reward is a function of the outcome."""
+    if not callable(reward):
+        raise InputError(
+            f"The reward is {quote(reward)}: it must be MoveObject, GoalImage or a function of an "
+            "Outcome that returns a Reward. (reward)"
+        )
 
 
 def no_reward(outcome: Outcome) -> Reward:

@@ -29,7 +29,13 @@ from egosim_jax.interactive.env.chunks import (
     view_of,
 )
 from egosim_jax.interactive.env.parts import OpenStep, part_rows
-from egosim_jax.interactive.env.rewards import Outcome, RewardFn, check_reward, no_reward
+from egosim_jax.interactive.env.rewards import (
+    Outcome,
+    RewardFn,
+    check_callable,
+    check_reward,
+    no_reward,
+)
 from egosim_jax.interactive.env.validity import validity
 from egosim_jax.io.bounded import quote
 from egosim_jax.runtime.phases import phase, show_phases
@@ -258,6 +264,7 @@ class WorldEnv(gymnasium.Env):
         low, high = self.actions.bounds
         self.action_space = spaces.Box(low, high, dtype=np.float64)
         self.observation_space = observation_space(backend.video, self.actions, self._observe)
+        check_callable(reward)
         self._running: RunningEpisode | None = None
         self._open: OpenStep | None = None
         self._ended = self._closed = False
@@ -298,7 +305,7 @@ class WorldEnv(gymnasium.Env):
         self, action: Float[np.ndarray, " d"]
     ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Move to a row in a straight line, over a full chunk."""
-        (target,) = self.actions.check([action], max_rows=1)
+        target = self.actions.check_row(action)
         return self.chunk_step(straight_path(self.running.row, target, self.chunk + 1))
 
     def chunk_step(

@@ -15,7 +15,13 @@ from jaxtyping import Bool, Float
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import Backend
 from egosim_jax.interactive.env.chunks import straight_path
-from egosim_jax.interactive.env.rewards import Outcome, RewardFn, check_reward, no_reward
+from egosim_jax.interactive.env.rewards import (
+    Outcome,
+    RewardFn,
+    check_callable,
+    check_reward,
+    no_reward,
+)
 from egosim_jax.interactive.env.single import (
     CLOSED,
     RunningEpisode,
@@ -65,11 +71,13 @@ class WorldVectorEnv(VectorEnv):
         check_counts({"num_envs": num_envs})
         self.num_envs, self.backend, self.actions = num_envs, backend, actions or ActionSpec()
         self._observe, self._max_chunks = tuple(observe), max_chunks
-        self._rewards = list(reward) if isinstance(reward, Sequence) else [reward] * num_envs
+        self._rewards = [reward] * num_envs if callable(reward) else list(reward)
         if len(self._rewards) != num_envs:
             raise InputError(
                 f"{len(self._rewards)} rewards for {num_envs} episodes: give one, or one for each."
             )
+        for given in self._rewards:
+            check_callable(given)
         low, high = self.actions.bounds
         self.single_action_space = spaces.Box(low, high, dtype=np.float64)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -147,7 +155,7 @@ class WorldVectorEnv(VectorEnv):
         """Move each episode to a row in a straight line, over a full chunk."""
         self._check_rows(actions)
         frames = self.chunk + 1
-        targets = [self.actions.check([row], max_rows=1)[0] for row in actions]
+        targets = [self.actions.check_row(row) for row in actions]
         rows = [
             straight_path(r.row, target, frames)
             for r, target in zip(self.running, targets, strict=True)

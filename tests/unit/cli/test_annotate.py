@@ -44,7 +44,7 @@ def test_a_video_without_clips_is_named_with_its_reason(video, tmp_path, capsys)
     shown = capsys.readouterr().err
     assert "bad: no clip: " in shown
     assert "is empty" in shown
-    assert "1 clips done, 0 refused, 0 failed" in shown
+    assert "1 clip done, 0 refused, 0 failed" in shown
 
 
 @pytest.mark.parametrize("options", [[], ["--focal", "120"]])
@@ -56,7 +56,7 @@ def test_an_assumed_focal_length_is_said(video, tmp_path, capsys, monkeypatch, o
     out = tmp_path / "out"
     command = ["data", "annotate", str(video), "--out", str(out), *OPTIONS, *options]
     assert main(command) == ExitCode.DONE
-    said = "1 clips do not show their focal length: a view of 90" in capsys.readouterr().err
+    said = "1 clip without a known focal length: a view of 90" in capsys.readouterr().err
     source = read_json(out / "cup" / ANNOTATION)["cameras"]["focal_source"]
     assert (said, source) == ((False, "--focal") if options else (True, "assumed"))
 
