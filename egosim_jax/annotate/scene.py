@@ -205,7 +205,7 @@ def build_state(record: Record, estimators: Estimators, config: AnnotateConfig) 
         standing = find_objects(
             record.require("first_frame"), depth.depth_m[0], cameras.intrinsics_px
         )
-        ids, names = join_objects(ids, names, standing)
+        ids, names = join_objects(ids, names, measured(standing, depth.confident[0]))
     state = state_from_depth(
         record.require("first_frame"),
         depth.depth_m[0],
@@ -220,6 +220,18 @@ def build_state(record: Record, estimators: Estimators, config: AnnotateConfig) 
     state = replace(state, provenance={"source": "video", "video_id": record.video_id})
     notes = {"state": config.state, "points": len(state.points_m), "objects": names}
     return record.add("scene", notes, state=state)
+
+
+def measured(
+    standing: Int32[np.ndarray, "h w"], confident: Bool[np.ndarray, "h w"]
+) -> Int32[np.ndarray, "h w"]:
+    """Return the objects whose depth is confident in half of their pixels; the others become 0.
+
+    Completed depth has bumps on walls and at the image border that look like objects.
+    """
+    sizes = np.bincount(standing.ravel())
+    known = np.bincount(standing.ravel(), weights=confident.ravel(), minlength=len(sizes))
+    return np.where((2 * known >= sizes)[standing], standing, 0)
 
 
 def join_objects(

@@ -35,8 +35,8 @@ egosim --help describes all commands, egosim COMMAND --help one with its options
 """Page that `egosim` alone prints."""
 
 
-ANNOUNCED = ("simulate", "generate", "evaluate", "play", "serve", "train", "data", "episode")
-"""Subcommands that load for seconds, and so print a line before the first import."""
+ANNOUNCED = ("simulate", "generate", "evaluate", "play", "serve", "train", "data annotate")
+"""Commands that load for seconds, and so print a line before the first import."""
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -47,7 +47,8 @@ def main(args: Sequence[str] | None = None) -> int:
         return 0
     program = f"egosim {given[0]}"
     module = PROGRAMS.get(given[0], "egosim_jax.cli.commands")
-    loaded = _load(module, program, announced=given[0] in ANNOUNCED, options=given)
+    words = next((known for known in ANNOUNCED if known.split() == given[: len(known.split())]), "")
+    loaded = _load(module, f"egosim {words}", announced=bool(words), options=given)
     if given[0] not in PROGRAMS:
         return loaded.run(args, programs=PROGRAMS)
     run = loaded.main

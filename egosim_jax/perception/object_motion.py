@@ -212,9 +212,10 @@ def _closed_on(
 
 
 def hand_name(action: Action, hand: int) -> str:
-    """Return how a note calls a hand of an action: by its number, if it is not the only one."""
+    """Return how a note calls a hand of an action: by its number, if others are shown."""
     one = "gripper" if action.kind == "robot" else "hand"
-    return f"the {one}" if action.joints_m.shape[1] == 1 else f"{one} {hand}"
+    shown = np.isfinite(action.joints_m).all(axis=(2, 3)).any(axis=0).sum()
+    return f"{one} {hand}" if shown > 1 else f"the {one}"
 
 
 def _best_candidate(

@@ -16,6 +16,7 @@ from egosim_jax.annotate.scene import (
     clean_first_frame,
     find_moved_objects,
     join_objects,
+    measured,
     plane_behind_objects,
     to_triplet,
 )
@@ -259,3 +260,9 @@ def test_the_background_is_judged_where_the_prior_draws_it(tmp_path):
     _, figures = to_triplet(replace(record, state=state, frames=still), config())
     assert figures["seen"] == 1
     assert figures["psnr_background"] > 35  # 22 with the cracks
+
+
+def test_an_object_needs_confident_depth_in_half_of_its_pixels():
+    standing = np.array([[0, 1, 1], [2, 2, 2]], np.int32)
+    confident = np.array([[False, True, False], [True, False, False]])
+    assert measured(standing, confident).tolist() == [[0, 1, 1], [0, 0, 0]]

@@ -78,7 +78,7 @@ def test_an_object_without_an_id_is_found_and_moved(clip, found_without_ids):
     bare, found = found_without_ids
     target = clip.state.points_m[clip.state.object_ids == clip.body_ids[clip.target]]
     assert found.names == {1: "object 1"}
-    assert found.notes == ("the hand moved something without an id: it is object 1 now",)
+    assert found.notes == ("hand 0 moved something without an id: it is object 1 now",)
     (points,) = found.new_objects.values()
     assert is_among(target, points).mean() > 0.95
     assert is_among(points, target).mean() > 0.95
