@@ -244,9 +244,11 @@ def join_objects(
     joined, named = ids.copy(), dict(names)
     for number in range(1, int(standing.max()) + 1):
         own = standing == number
+        if not own.any():
+            continue
         known = np.unique(ids[own & (ids > 0)], return_counts=True)
         shared = int(known[1].max(initial=0))
-        if own.any() and 2 * shared > own.sum():
+        if 2 * shared > own.sum():
             new = int(known[0][known[1].argmax()])
         else:
             new = max(int(joined.max()), *named, 0) + 1

@@ -266,3 +266,5 @@ def test_an_object_needs_confident_depth_in_half_of_its_pixels():
     standing = np.array([[0, 1, 1], [2, 2, 2]], np.int32)
     confident = np.array([[False, True, False], [True, False, False]])
     assert measured(standing, confident).tolist() == [[0, 1, 1], [0, 0, 0]]
+    ids, names = join_objects(np.zeros((2, 3), np.int32), {}, np.where(standing == 2, standing, 0))
+    assert (ids.tolist(), names) == ([[0, 0, 0], [1, 1, 1]], {1: "object 1"})
