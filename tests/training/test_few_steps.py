@@ -90,6 +90,14 @@ def test_a_batch_is_divided_among_the_steps():
     assert FewSteps(model=MODEL, others=0.0).bounds(3, 3) == [0, 1, 2, 3]
 
 
+def test_a_batch_may_be_smaller_than_the_number_of_steps(networks, batch):
+    task = FewSteps(model=MODEL)
+    two = {name: array[:2] for name, array in batch.items()}
+    loss, metrics = task.loss(networks, two, task.keys(jax.random.key(0), 2))
+    assert np.isfinite(loss)
+    assert metrics.keys() == {"loss_step_1", "loss_step_3"}  # no sample for the second
+
+
 def test_models_that_do_not_predict_velocities_of_complete_clips_are_refused():
     noise = replace(MODEL, process=RectifiedFlow(prediction="epsilon", sigma_max=0.999))
     for model in (noise, configs.get("tabletop_student")):

@@ -79,6 +79,7 @@ class FewSteps(Denoising):
         metrics = {
             f"loss_step_{number}": errors[start:end].mean()
             for number, (start, end) in enumerate(pairwise(bounds), start=1)
+            if end > start
         }
         return errors.mean(), metrics
 
@@ -104,6 +105,8 @@ class FewSteps(Denoising):
             count = start - bounds[number - 1]
             inputs.append(x[:count])
             x = x[count:]
+            if not len(x):  # a batch smaller than the number of steps
+                return inputs
             rest = jax.tree.map(lambda array, start=start: array[start:], condition)
             denoise = denoising(self.model, frozen, rest, x)
             now, then = jnp.asarray(times[number - 1 : number + 1], jnp.float32)
