@@ -87,17 +87,19 @@ def integrate(
     solver: Solver,
     steps: SupportsIndex | Sequence[int | float],
     keys: Key[Array, " b"] | None = None,
+    count: int | None = None,
 ) -> Float[Array, "b f h w c"]:
     """Turn noise into latents, one network evaluation a step: one scan, no host round trips.
 
     `steps` is the number of steps, or the timesteps to visit. `keys`, one for each sample, draw the
-    noise of a stochastic solver; step i uses `fold_in(key, i)`.
+    noise of a stochastic solver; step i uses `fold_in(key, i)`. With `count`, only so many of the
+    steps are taken.
     """
 
     def advance(state: Any, row: tuple) -> tuple[Any, None]:
         return _advance(lambda x, t: (denoise(x, t), None), process, solver, state, row)
 
-    rows = _rows(process, solver, steps, keys)
+    rows = jax.tree.map(lambda row: row[:count], _rows(process, solver, steps, keys))
     return jax.lax.scan(advance, solver.start(noise), rows)[0].x
 
 

@@ -57,7 +57,6 @@ def test_the_last_step_predicts_from_where_the_sampler_is(networks, batch):
 def test_a_step_has_no_gradient_through_the_steps_before_it(networks, batch):
     task = FewSteps(model=MODEL, others=0.0)
     keys = task.keys(jax.random.key(1), BATCH)
-    times = MODEL.process.times(3)[:-1]
     noise = jnp.asarray(np.random.default_rng(1).normal(size=batch["target"].shape), jnp.float32)
 
     graph, weights = nnx.split(networks)
@@ -65,7 +64,7 @@ def test_a_step_has_no_gradient_through_the_steps_before_it(networks, batch):
     def total(weights):
         merged = nnx.merge(graph, weights)
         condition = condition_of(merged, batch, MODEL)
-        return sum(x.sum() for x in task.sampled(merged, condition, noise, times, [0, 2, 5, 8]))
+        return sum(x.sum() for x in task.sampled(merged, condition, noise, [0, 2, 5, 8]))
 
     assert not any(np.any(leaf) for leaf in jax.tree.leaves(jax.grad(total)(weights)))
     learned = jax.grad(lambda weights: task.loss(nnx.merge(graph, weights), batch, keys)[0])

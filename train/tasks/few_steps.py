@@ -3,12 +3,8 @@
 A sampler of few steps hands its network inputs that ordinary training never has: from the second
 step on, they contain the network's own prediction instead of the target. So most samples of
 a batch are inputs of the sampler here. With its times t_1 > ... > t_n, a sample of step k begins
-with noise and takes the k - 1 steps before it, without gradients:
-
-    x_1 = e,   x_{k+1} = alpha(t_{k+1}) x0_k + sigma(t_{k+1}) e_k
-
-where x0_k and e_k are the data and noise that the network predicts at x_k (Euler's step for a
-rectified flow, DDIM's for a variance-preserving process). Its loss is the error of the prediction,
+with noise and takes the k - 1 steps before it, as the model's solver does, without gradients. With
+x0_k, the data that the network predicts there, its loss is the error of the prediction,
 
     | x0_k - x0 |^2 / sigma(t_k)^2
 
@@ -29,6 +25,7 @@ from flax import nnx
 from jaxtyping import Array, Float, Key
 
 from egosim_jax.conditioning import Condition
+from egosim_jax.diffusion.solver import integrate
 from egosim_jax.train.task import Batch, Metrics
 from egosim_jax.train.tasks.denoising import Denoising, denoising, loss_weights
 from egosim_jax.types import InputError
@@ -71,7 +68,7 @@ class FewSteps(Denoising):
         level = time[:, None, None, None, None]
         alpha, sigma = process.alpha(level), process.sigma(level)
         noisy = process.add_noise(target, noise, level)[: bounds[0]]
-        x = jnp.concatenate([noisy, *self.sampled(networks, condition, noise, times, bounds)])
+        x = jnp.concatenate([noisy, *self.sampled(networks, condition, noise, bounds)])
         denoise = denoising(self.model, networks, condition, target)
         found = process.to_x0(x, denoise(x, process.timesteps(time)), alpha, sigma)
         weights = loss_weights(target, batch.get("prior", target), self.change_loss_weight)
@@ -93,27 +90,24 @@ class FewSteps(Denoising):
         networks: Any,
         condition: Condition,
         noise: Float[Array, "b f h w c"],
-        times: np.ndarray,
         bounds: list[int],
     ) -> list[Float[Array, "n f h w c"]]:
         """Return each step's inputs, sampled by the network without gradients."""
         graph, weights = nnx.split(networks)
         frozen = nnx.merge(graph, jax.lax.stop_gradient(weights))
         condition = jax.lax.stop_gradient(condition)
-        process, x, inputs = self.model.process, noise[bounds[0] :], []
-        for number, start in enumerate(bounds[1:-1], start=1):
-            count = start - bounds[number - 1]
-            inputs.append(x[:count])
-            x = x[count:]
-            if not len(x):  # a batch smaller than the number of steps
-                return inputs
-            rest = jax.tree.map(lambda array, start=start: array[start:], condition)
-            denoise = denoising(self.model, frozen, rest, x)
-            now, then = jnp.asarray(times[number - 1 : number + 1], jnp.float32)
-            output = denoise(x, process.timesteps(jnp.full(len(x), now)))
-            output = output.astype(jnp.float32)
-            alpha, sigma = process.alpha(now), process.sigma(now)
-            x0 = process.to_x0(x, output, alpha, sigma)
-            epsilon = process.to_epsilon(x, output, alpha, sigma)
-            x = process.add_noise(x0, epsilon, then)
-        return [*inputs, x]
+        inputs = []
+        for taken, (start, end) in enumerate(pairwise(bounds)):
+            if end == start:  # a batch smaller than the number of steps
+                continue
+            own = jax.tree.map(lambda array, start=start, end=end: array[start:end], condition)
+            x = integrate(
+                denoising(self.model, frozen, own, noise[start:end]),
+                noise[start:end],
+                process=self.model.process,
+                solver=self.model.solver,
+                steps=self.model.visited,
+                count=taken,
+            )
+            inputs.append(x)
+        return inputs
