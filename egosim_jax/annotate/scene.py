@@ -7,10 +7,11 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from egosim_jax.annotate.config import AnnotateConfig, Estimators
 from egosim_jax.annotate.hand_tracks import visible
+from egosim_jax.annotate.objects import MOVED, find_moved_objects, join_objects, measured
 from egosim_jax.annotate.prepare import RefusedError
 from egosim_jax.annotate.record import Record
 from egosim_jax.annotate.stages import (
@@ -31,10 +32,8 @@ from egosim_jax.rendering import POINT_PX
 from egosim_jax.rendering.reference import splat
 from egosim_jax.state.depth import state_from_depth
 from egosim_jax.state.instances import find_objects
-from egosim_jax.types import SceneState, Triplet, object_name
+from egosim_jax.types import SceneState, Triplet
 
-MOVED = "moved object"
-"""Name of an object that a hand moves, if no network names it."""
 MIN_FIXED_DB = 16.0
 """Minimum PSNR of the background if the camera stays in its place, in decibels."""
 PLATE_MARGIN = 1 / 80
@@ -138,46 +137,6 @@ def _sparse_depth(record: Record) -> DepthEstimate:
     )
 
 
-def find_moved_objects(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
-    """Add `moved_ids` with pixels and names, and `contacts`: the objects that hands move.
-
-    An object that a network segmented keeps its id. A sleeve counts as an arm.
-    """
-    from egosim_jax.perception.moved import find_moved
-
-    ids, names = record.require("object_ids").copy(), dict(record.names or {})
-    found = []
-    if record.hands is not None and visible(record.hands).any():
-        depth_m = record.require("depth").depth_m[0]
-        found = find_moved(
-            record.frames,
-            record.moving,
-            record.hands,
-            record.cameras,
-            depth_m,
-            fps=float(record.fps),
-        )
-    numbers: list[int] = []
-    contacts: list[tuple[int, int, int]] = []
-    for moved in found:
-        known, count = np.unique(ids[0][moved.first], return_counts=True)
-        number = int(known[count.argmax()])
-        if moved.worn:
-            number = -1
-        elif number <= 0:
-            number = max(int(ids.max()), *names, 0) + 1
-            names[number] = MOVED if MOVED not in names.values() else f"{MOVED} {number}"
-        ids[moved.shown & (ids == 0)] = number
-        if number > 0:
-            numbers.append(number)
-            contacts += [(frame, side, number) for frame, side in moved.contacts]
-    notes = {"moved": {number: int((ids[0] == number).sum()) for number in numbers}}
-    return record.add(
-        "objects", notes, object_ids=ids, names=names, moved_ids=np.array(numbers, np.int32),
-        contacts=np.array(contacts, np.int32).reshape(-1, 3),
-    )  # fmt: skip
-
-
 def clean_first_frame(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
     """Add `first_frame`: hands and arms are replaced from other frames, or inpainted."""
     from egosim_jax.perception.plate import clean_plate
@@ -220,41 +179,6 @@ def build_state(record: Record, estimators: Estimators, config: AnnotateConfig) 
     state = replace(state, provenance={"source": "video", "video_id": record.video_id})
     notes = {"state": config.state, "points": len(state.points_m), "objects": names}
     return record.add("scene", notes, state=state)
-
-
-def measured(
-    standing: Int32[np.ndarray, "h w"], confident: Bool[np.ndarray, "h w"]
-) -> Int32[np.ndarray, "h w"]:
-    """Return the objects whose depth is confident in half of their pixels; the others become 0.
-
-    Completed depth has bumps on walls and at the image border that look like objects.
-    """
-    sizes = np.bincount(standing.ravel())
-    known = np.bincount(standing.ravel(), weights=confident.ravel(), minlength=len(sizes))
-    return np.where((2 * known >= sizes)[standing], standing, 0)
-
-
-def join_objects(
-    ids: Int32[np.ndarray, "h w"], names: Mapping[int, str], standing: Int32[np.ndarray, "h w"]
-) -> tuple[Int32[np.ndarray, "h w"], dict[int, str]]:
-    """Return ids and names of the objects that hands move, joined by other objects.
-
-    An object whose pixels are mostly on a moved one is part of it.
-    """
-    joined, named = ids.copy(), dict(names)
-    for number in range(1, int(standing.max()) + 1):
-        own = standing == number
-        if not own.any():
-            continue
-        known = np.unique(ids[own & (ids > 0)], return_counts=True)
-        shared = int(known[1].max(initial=0))
-        if 2 * shared > own.sum():
-            new = int(known[0][known[1].argmax()])
-        else:
-            new = max(int(joined.max()), *named, 0) + 1
-            named[new] = object_name(new, {})
-        joined[own & (joined == 0)] = new
-    return joined, named
 
 
 def extend_state(

@@ -9,14 +9,12 @@ import pytest
 from egosim_jax.annotate.clip import Job, open_record
 from egosim_jax.annotate.frames import Sampling
 from egosim_jax.annotate.hand_tracks import drop_flashes, hold_hands, visible
+from egosim_jax.annotate.objects import find_moved_objects, join_objects, measured
 from egosim_jax.annotate.prepare import RefusedError
 from egosim_jax.annotate.scene import (
     STAGES,
     check_prior,
     clean_first_frame,
-    find_moved_objects,
-    join_objects,
-    measured,
     plane_behind_objects,
     to_triplet,
 )
