@@ -48,7 +48,7 @@ def main(args: Sequence[str] | None = None) -> int:
     program = f"egosim {given[0]}"
     module = PROGRAMS.get(given[0], "egosim_jax.cli.commands")
     words = next((known for known in ANNOUNCED if known.split() == given[: len(known.split())]), "")
-    loaded = _load(module, f"egosim {words}", announced=bool(words), options=given)
+    loaded = _load(module, f"egosim {words or given[0]}", announced=bool(words), options=given)
     if given[0] not in PROGRAMS:
         return loaded.run(args, programs=PROGRAMS)
     run = loaded.main

@@ -172,7 +172,7 @@ def estimate_object_motion(
                 models.add(new)
                 note = f"moved something without an id: it is object {number} now"
             if note:
-                notes.append(f"{hand_name(action, hand)} {note}")
+                notes.append(f"{_hand_name(action, hand)} {note}")
             if best is not None:
                 change, motion = best
                 state = models.state
@@ -211,7 +211,7 @@ def _closed_on(
     return held
 
 
-def hand_name(action: Action, hand: int) -> str:
+def _hand_name(action: Action, hand: int) -> str:
     """Return how a note calls a hand of an action: by its number, if others are shown."""
     one = "gripper" if action.kind == "robot" else "hand"
     shown = np.isfinite(action.joints_m).all(axis=(2, 3)).any(axis=0).sum()

@@ -28,8 +28,10 @@ def ignore() -> None:
 
 def print_how_to_continue() -> None:
     """Print the command line that continues an interrupted run."""
-    # `egosim train` is a program of two words (`cli/__main__.py`).
-    command = " ".join([sys.argv[0], *map(shlex.quote, sys.argv[1:])])
+    program, *options = sys.argv
+    # `egosim train` is a program of two words (`cli/__main__.py`); others are paths.
+    words = [program] if os.sep in program else program.split()
+    command = shlex.join([*words, *options])
     print(f"interrupted; to continue: {command}", file=sys.stderr, flush=True)
 
 

@@ -23,7 +23,7 @@ from egosim_jax.cli.generate import Generate
 from egosim_jax.cli.serve import Serve
 from egosim_jax.cli.simulate import Simulate
 from egosim_jax.convert.__main__ import main as convert
-from egosim_jax.runtime import command
+from egosim_jax.runtime import command, interrupts
 from egosim_jax.train.__main__ import main as train
 from egosim_jax.train.config import TrainConfig
 from egosim_jax.train.recipes import RECIPES
@@ -164,6 +164,19 @@ def test_too_little_memory_is_one_line(capsys):
     assert capsys.readouterr().err == (
         "error: not enough memory. Use smaller batches or a machine with more memory.\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["egosim train", "debug", "--out", "a b"], "egosim train debug --out 'a b'"),
+        (["/my bin/egosim", "simulate"], "'/my bin/egosim' simulate"),
+    ],
+)
+def test_the_line_that_continues_can_be_run(monkeypatch, capsys, argv, said):
+    monkeypatch.setattr(sys, "argv", argv)
+    interrupts.print_how_to_continue()
+    assert capsys.readouterr().err == f"interrupted; to continue: {said}\n"
 
 
 def test_ctrl_c_says_how_to_continue(monkeypatch, capsys):

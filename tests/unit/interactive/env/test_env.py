@@ -74,8 +74,8 @@ def test_a_plain_step_moves_in_a_straight_line():
     ("rows", "message"),
     [
         (np.full((1, 7), np.nan), "nan as right x: all must be finite"),
-        (np.zeros((1, 6)), r"shape \(1, 6\).*1 to 4 rows of 7"),
-        (np.zeros((9, 7)), r"1 to 4 rows of 7"),
+        (np.zeros((1, 6)), r"shape \(1, 6\).*must have 1 to 4 rows of 7 numbers"),
+        (np.zeros((9, 7)), r"must have 1 to 4 rows of 7 numbers"),
         (np.full((1, 7), 300.0), "300 as right x: it must be from -0.35 to 0.35"),
     ],
 )

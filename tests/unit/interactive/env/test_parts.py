@@ -64,7 +64,7 @@ def test_the_hand_changes_course_within_a_clip(env):
 
 
 def test_a_short_part_is_padded_and_a_long_one_refused(env):
-    with pytest.raises(InputError, match=r"1 to 2 rows of 7"):
+    with pytest.raises(InputError, match=r"must have 1 to 2 rows of 7 numbers"):
         env.part_step(ahead(env)[:3])
     held = env.part_step(ahead(env)[:1])[0]
     np.testing.assert_array_equal(held["row"], ahead(env)[0])

@@ -77,11 +77,11 @@ def test_a_full_queue_and_a_busy_session_are_refused_and_nothing_is_lost(tmp_pat
     [
         ({"row": np.full(7, np.nan)}, "Row 0 of the actions has nan as right x: all must be"),
         ({"row": np.full(7, np.inf)}, "must be finite"),
-        ({"row": np.zeros(63)}, "1 to 4 rows of 7"),
+        ({"row": np.zeros(63)}, "must have 1 to 4 rows of 7 numbers"),
         ({"row": [0.1, 0.2, 0.1, 0, 0, 0, 2]}, "2 as right closure: it must be from 0 to 1"),
         ({"row": [150, 20, 160, 0, 0, 0, 0]}, "150 as right x.*Positions are in meters"),
         ({"row": [0.1, 0.2, 0.1, 0, 0, 180, 0]}, "180 as right rz.*rotations in radians"),
-        ({"rows": 5}, "1 to 4 rows of 7"),
+        ({"rows": 5}, "must have 1 to 4 rows of 7 numbers"),
     ],
 )
 def test_an_invalid_action_is_refused_with_rule_and_value(store, change, message):
