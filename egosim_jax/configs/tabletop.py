@@ -17,7 +17,7 @@ CONFIG = ModelConfig(
     name="tabletop",
     video=VideoSpec(frames=17, height=96, width=160, fps=8),
     dit=WanDiTConfig(
-        dim=256, ffn_dim=768, heads=4, layers=6, text_dim=64, image_dim=64, remat="products"
+        dim=256, ffn_dim=768, heads=4, layers=10, text_dim=64, image_dim=64, remat="products"
     ),
     vae=WanVAEConfig(
         dim=8,
