@@ -15,9 +15,11 @@ new frame of a clip. Sessions of remote clients are in `server`. Needs the extra
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib.util import find_spec
+from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.runtime.phases import phase, show_phases
@@ -33,6 +35,7 @@ __all__ = ["ActionSpec", "Start", "load_backend", "make", "make_vec", "register"
 
 ID = "egosim_jax/Tabletop-v0"
 World = Literal["generated", "true"]
+_POSITIONAL = ("backend", "num_envs")
 
 
 @show_phases()
@@ -53,6 +56,8 @@ def load_backend(
     and compiled. Without `compile` it is compiled at the first step. `update_every` updates the
     state after each clip or, with a causal student, after each chunk of a clip.
     """
+    if world not in get_args(World):
+        raise InputError(f"There is no world {world!r:.40}: it must be 'generated' or 'true'.")
     with phase(f"loads JAX and the {world} world of {config}"):
         from dataclasses import replace
 
@@ -70,8 +75,6 @@ def load_backend(
     if world == "true":
         return TrueWorld(video=model.video)
     check_update_every(update_every, model.chunk_frames, model.name, perception)
-    if world != "generated":
-        raise InputError(f"There is no world {world!r:.40}: it must be 'generated' or 'true'.")
     mesh = make_mesh(MeshConfig(data=-1, fsdp=1))
     folder = configs.weights_of(config, None if weights is None else Path(weights))
     generator = Generator.load(model, folder, mesh=mesh)
@@ -92,6 +95,7 @@ def make(*, backend: Backend | None = None, world: World = "generated", **option
     """Return a `WorldEnv` of a backend, or of a world by name."""
     from egosim_jax.interactive.env.single import WorldEnv
 
+    _check_options(WorldEnv, options)
     return WorldEnv(backend or load_backend(world), **options)
 
 
@@ -105,7 +109,18 @@ def make_vec(
     """Return a `WorldVectorEnv` of a backend, or of a world by name."""
     from egosim_jax.interactive.env.vector import WorldVectorEnv
 
+    _check_options(WorldVectorEnv, options)
     return WorldVectorEnv(backend or load_backend(world, batch=num_envs), num_envs, **options)
+
+
+def _check_options(env: type, options: Mapping[str, Any]) -> None:
+    """Raise `InputError` for an option that an environment lacks: a world takes long to load."""
+    known = ["backend", "world", *(n for n in signature(env).parameters if n not in _POSITIONAL)]
+    if unknown := [name for name in options if name not in known]:
+        raise InputError(
+            f"There is no option {unknown[0]!r:.40} of an environment: choose from "
+            f"{', '.join(known)}."
+        )
 
 
 def register() -> None:

@@ -314,7 +314,8 @@ class WorldEnv(gymnasium.Env):
         """Simulate 1 to `chunk` rows, one per frame, and hold the last row until the chunk ends.
 
         `info` has the chunk number, padded frames, hidden hands, hash of the state, names and poses
-        of the objects, seconds of each phase, `validity`, `object_validity` and `success`.
+        of the objects, seconds of each phase, `validity`, `object_validity` with the object that it
+        is of, and `success`.
         """
         running = self._continued()
         chunk = running.chunk(actions, prompt=prompt)

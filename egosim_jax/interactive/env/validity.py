@@ -35,8 +35,8 @@ def validity(state: SceneState, step: Step, action: Action, renderer: Renderer) 
     """Return the share of pixels that agree with the state, from 0 to 1, of two kinds.
 
     `validity` is of the background. `object_validity` is of the object that agrees least, of those
-    that no hand touches; `state` is the state before the step. Without such pixels, a figure
-    is absent.
+    that no hand touches, and `least_valid_object` its id; `state` is the state before the step.
+    Without such pixels, a figure is absent.
     """
     view, frames = step.view, step.clip.frames
     skeletons = renderer.draw_hands(action.joints_m, action.cameras, kind=action.kind)[1]
@@ -44,13 +44,16 @@ def validity(state: SceneState, step: Step, action: Action, renderer: Renderer) 
     arms = hand_silhouette(action.joints_m, action.kind, action.cameras, HandShape()) >= 0
     seen = (view.mask == 0) & ~_widen(arms, ARM_MARGIN)
     agree = _agree(_blur(frames), _blur(view.frames))
-    shares = []
+    shares: dict[int, float] = {}
     for number in untouched(state, step.state, action.joints_m):
         pixels = seen & _without_outline(view.object_ids == number)
         if np.count_nonzero(pixels) >= MIN_OBJECT_PIXELS:
-            shares.append(float(agree[pixels].mean()))
+            shares[number] = float(agree[pixels].mean())
     found = {"validity": float(steady.mean())} if steady.size else {}
-    return found | ({"object_validity": min(shares)} if shares else {})
+    if shares:
+        least = min(shares, key=shares.__getitem__)
+        found |= {"object_validity": shares[least], "least_valid_object": least}
+    return found
 
 
 def steady_pixels(view: View, hands: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:

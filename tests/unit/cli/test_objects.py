@@ -13,7 +13,7 @@ from egosim_jax.rendering.objects import color_of, draw_objects
 from egosim_jax.rendering.reference import render
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.state.depth import state_from_depth
-from egosim_jax.types import InputError
+from egosim_jax.types import InputError, View
 from tests.boxes import GREEN, RED, cameras, cast, push
 
 VIEW = cameras(17)
@@ -91,6 +91,34 @@ def test_a_view_is_colored_by_object(scene):
     tint = np.median(drawn[view.object_ids == 1].astype(float), axis=0)
     plain = np.median(view.frames[view.object_ids == 1].astype(float), axis=0)
     np.testing.assert_allclose(tint, 0.4 * plain + 0.6 * np.array(color_of(1)), atol=25)
+
+
+def white(frame):
+    """Bounds of the letters: rows, columns."""
+    rows, columns = np.nonzero((frame > 100).all(axis=-1))
+    return rows.min(), rows.max(), columns.min(), columns.max()
+
+
+@pytest.mark.parametrize("column", [0, 79, 158], ids=["left", "middle", "right"])
+def test_names_of_near_objects_do_not_overlap_and_stay_in_the_image(column):
+    ids = np.zeros((1, 96, 160), np.int32)
+    ids[0, 40:42, column : column + 2], ids[0, 42:44, column : column + 2] = 1, 2
+    frames = np.zeros((1, 96, 160, 3), np.uint8)
+    view = View(
+        frames=frames, mask=ids.astype(np.uint8), depth_m=ids.astype(np.float32), object_ids=ids
+    )
+    names = {1: "first long name", 2: "second long name"}
+    both = white(draw_objects(view, names)[0])
+    alone = [
+        white(draw_objects(replace(view, object_ids=np.where(ids == n, n, 0)), names)[0])
+        for n in names
+    ]
+    heights = [bottom - top + 1 for top, bottom, *_ in alone]
+    assert both[1] - both[0] + 1 >= sum(heights)
+    assert both[2] > 0
+    assert both[3] < 159
+    widths = [right - left for *_, left, right in alone]
+    assert both[3] - both[2] >= max(widths)
 
 
 def save(image, path, mode):

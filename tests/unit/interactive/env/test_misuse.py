@@ -1,5 +1,6 @@
 """Wrong calls of both environments: each is refused with a message, and changes nothing."""
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -151,3 +152,13 @@ def test_the_advice_about_an_unknown_object_works():
     numbers = make(0).reset(seed=3)[1]["objects"]
     for number in numbers:
         make(0, reward=MoveObject(number=number, offset_m=(0.1, 0.0, 0.0))).reset(seed=3)
+
+
+@pytest.mark.parametrize("vector", [False, True], ids=["single", "vector"])
+def test_an_unknown_option_is_refused_before_a_world_is_loaded(vector, capsys):
+    known = "choose from backend, world, actions, observe, reward, max_chunks"
+    make = gymnasium.make_vec if vector else gymnasium.make
+    count = {"num_envs": 2} if vector else {}
+    with pytest.raises(InputError, match=f"no option 'wrld' of an environment: {known}"):
+        make("egosim_jax/Tabletop-v0", wrld="true", **count)
+    assert capsys.readouterr().err == ""

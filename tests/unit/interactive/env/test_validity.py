@@ -66,7 +66,8 @@ def measured(frames, after=None, acted=None):
 
 
 def test_frames_of_the_state_agree_with_it():
-    assert measured(view().frames) == {"validity": 1.0, "object_validity": 1.0}
+    agree = {"validity": 1.0, "object_validity": 1.0, "least_valid_object": CONE}
+    assert measured(view().frames) == agree
 
 
 def test_a_faded_object_lowers_only_the_figure_of_objects():
@@ -75,12 +76,14 @@ def test_a_faded_object_lowers_only_the_figure_of_objects():
     found = measured(faded)
     assert found["validity"] == 1.0
     assert found["object_validity"] == pytest.approx(2 / 5)
+    assert found["least_valid_object"] == CONE
 
 
 def test_another_background_lowers_only_its_own_figure():
     frames = view().frames.copy()
     frames[view().object_ids == 0] += 60
-    assert measured(frames) == {"validity": 0.0, "object_validity": 1.0}
+    found = measured(frames)
+    assert (found["validity"], found["object_validity"]) == (0.0, 1.0)
 
 
 def test_softer_frames_of_an_object_agree_with_the_state():
