@@ -163,11 +163,12 @@ class Annotate:
     def _finish(self, report: dict) -> int:
         counts = report["clips"]
         empty = {name: video for name, video in report["videos"].items() if not video["done"]}
-        for name, video in empty.items():
+        for name, video in report["videos"].items():
             clips = (about for about in report["annotations"] if about["source"] == name)
             reasons = [video.get("problem"), *(about.get("reason") for about in clips)]
+            about = "no clip" if name in empty else "not every clip"
             for reason in dict.fromkeys(filter(None, reasons)):
-                print(printable(f"{name}: no clip: {reason}"), file=sys.stderr)
+                print(printable(f"{name}: {about}: {reason}"), file=sys.stderr)
         cameras = [about["cameras"] for about in report["annotations"] if about.get("cameras")]
         assumed = [found for found in cameras if found["focal_source"] == "assumed"]
         if assumed:
@@ -179,7 +180,7 @@ class Annotate:
             )
         print(
             f"{counted(counts['done'], 'clip')} done, {counts['refused']} refused, "
-            f"{counts['failed']} failed; see {self.out / 'index.html'}",
+            f"{counts['failed']} failed, of {counted(len(report['videos']), 'video')}; see {self.out / 'index.html'}",
             file=sys.stderr,
         )
         print(self.out)

@@ -18,6 +18,7 @@ from egosim_jax.evaluation.metrics.report import (
     summarize,
 )
 from egosim_jax.evaluation.scoring import OWN, Protocol, Row, Scoring, row_of
+from egosim_jax.runtime.terminal import counted
 
 KNOWN = {
     "depth_err": Column("Depth ERR of the paper", "{:.3f}", "lower"),
@@ -216,7 +217,7 @@ class Evaluation:
     def caption(self, group: str) -> str:
         """Return the title of a group's table, with its number of clips."""
         count = max(row["clips"] for row in self.summaries()[group].values())
-        return f"{self.groups.get(group, group)}, {count} clips"
+        return f"{self.groups.get(group, f'{self.group} {group}')}, {counted(count, 'clip')}"
 
     def print(self) -> None:
         """Print the table and paired differences of each group, and the protocol."""

@@ -167,8 +167,8 @@ def test_the_report_has_definitions_and_a_summary_for_each_split(clips, run, tmp
     assert {"psnr", "ssim", "lpips_alex", "spread", "frames"} <= set(report["definitions"])
     assert report["splits"]["train"]["generated"]["clips"] == 1
     printed = capsys.readouterr().out
-    assert "train, 1 clips" in printed
-    assert "test, 1 clips" in printed
+    assert "split train, 1 clip:" in printed
+    assert "split test, 1 clip:" in printed
 
 
 def test_a_ground_truth_that_ends_before_the_clip_is_named(clips, run, capsys):
