@@ -180,7 +180,8 @@ class Annotate:
             )
         print(
             f"{counted(counts['done'], 'clip')} done, {counts['refused']} refused, "
-            f"{counts['failed']} failed, of {counted(len(report['videos']), 'video')}; see {self.out / 'index.html'}",
+            f"{counts['failed']} failed, of {counted(len(report['videos']), 'video')}; "
+            f"see {self.out / 'index.html'}",
             file=sys.stderr,
         )
         print(self.out)
