@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
+from egosim_jax.annotate.captions import RULE, caption_by_rule
 from egosim_jax.annotate.config import AnnotateConfig, Estimators
 from egosim_jax.annotate.hand_tracks import visible
 from egosim_jax.annotate.objects import MOVED, find_moved_objects, join_objects, measured
 from egosim_jax.annotate.prepare import RefusedError
 from egosim_jax.annotate.record import Record
 from egosim_jax.annotate.stages import (
-    SIDES,
     Stage,
     draw_silhouettes,
     find_cameras,
@@ -217,26 +217,10 @@ def add_caption(record: Record, estimators: Estimators, config: AnnotateConfig) 
     elif estimators.captioner is not None:
         prompt, source = estimators.captioner(record.frames)[0], config.caption or "network"
     else:
-        prompt, source = plain_caption(record, names), "rule"
+        human = record.recording.kind == "human"
+        seen = visible(record.require("hands")).any(axis=0).tolist() if human else []
+        prompt, source = caption_by_rule(seen, names, record.recording.kind), RULE
     return record.add("caption", {"source": source, "names": names}, prompt=prompt)
-
-
-def plain_caption(record: Record, names: list[str]) -> str:
-    """Return a caption with the visible hands and the known objects.
-
-    It does not name the action: without a network, no stage recognizes actions.
-    """
-    what = f" near {', '.join(names)}" if names else ""
-    if record.recording.kind == "robot":
-        return f"A robot gripper moves in view of a camera{what}."
-    seen = visible(record.require("hands"))
-    sides = [side for number, side in enumerate(SIDES) if seen[:, number].any()]
-    if not sides:
-        return f"A wearer looks at a scene without moving hands in view{what}."
-    who = (
-        "The wearer's two hands move" if len(sides) == 2 else f"The wearer's {sides[0]} hand moves"
-    )
-    return f"{who} in view of a camera{what}."
 
 
 def to_triplet(record: Record, config: AnnotateConfig) -> tuple[Triplet, dict[str, Any]]:

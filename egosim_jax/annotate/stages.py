@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from einops import rearrange
 
+from egosim_jax.annotate.captions import SIDES
 from egosim_jax.annotate.config import AnnotateConfig, Estimators, Side
 from egosim_jax.annotate.frames import read_searched_frames
 from egosim_jax.annotate.hand_tracks import (
@@ -42,7 +43,6 @@ from egosim_jax.perception.estimates import (
 )
 from egosim_jax.types import Cameras, InputError
 
-SIDES = ("left", "right")
 MAX_MIRRORED = 0.35
 """Maximum fraction of a hand's frames in which its joints look like the other side's."""
 KEY_FRAMES = 6

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from egosim_jax.annotate.captions import RULE, caption_by_rule
 from egosim_jax.annotate.clip import ANNOTATION
 from egosim_jax.data.crop import Crop, plan_crop
 from egosim_jax.io.bounded import listing, quote_path, read_json
@@ -61,6 +64,7 @@ def episode_from(folder: Path, video: VideoSpec, *, clips: int | None = None) ->
     frames = [np.stack([crop.resample(frame) for frame in recorded.frames[k]]) for k in picked]
     cameras = crop.intrinsics(arrays["intrinsics_px"])
     kinds: dict[int, Kind] = {joints: kind for kind, joints in JOINTS.items()}
+    kind = kinds[arrays["joints_m"].shape[2]]
     return Episode(
         state=snapshot.load(folder / "state"),
         actions=tuple(
@@ -72,8 +76,8 @@ def episode_from(folder: Path, video: VideoSpec, *, clips: int | None = None) ->
                     width=video.width,
                 ),
                 joints_m=_reachable(arrays["joints_m"][k]),
-                kind=kinds[arrays["joints_m"].shape[2]],
-                prompt=prompt,
+                kind=kind,
+                prompt=_caption(about, prompt, arrays["joints_m"][k], kind),
             )
             for k in picked
         ),
@@ -87,6 +91,17 @@ def crop_to(video: VideoSpec, size: tuple[int, ...], *, name: str) -> Crop:
     """Return how images of a height and width are fitted to a model's size."""
     fix = "Choose a model whose clips have a similar shape. (--config)"
     return plan_crop((size[0], size[1]), (video.height, video.width), name=name, fix=fix)
+
+
+def _caption(about: Mapping[str, Any], prompt: str, joints_m: np.ndarray, kind: Kind) -> str:
+    """Return the caption of a part of a recording: a rule says which hands this part shows."""
+    made = about.get("caption")
+    if not isinstance(made, dict) or made.get("source") != RULE:
+        return prompt
+    names = made.get("names")
+    known = [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
+    seen = np.isfinite(joints_m).all(axis=(2, 3)).any(axis=0).tolist()
+    return caption_by_rule(seen, known, kind)
 
 
 def _reachable(joints_m: np.ndarray) -> np.ndarray:

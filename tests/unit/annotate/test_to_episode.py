@@ -1,10 +1,16 @@
 """Episodes of annotated clips."""
 
+import shutil
+
 import numpy as np
 import pytest
 
+from egosim_jax.annotate.captions import RULE
+from egosim_jax.annotate.clip import ANNOTATION
 from egosim_jax.annotate.to_episode import episode_from
 from egosim_jax.geometry import invert, project, transform
+from egosim_jax.io.bounded import read_json
+from egosim_jax.io.run import write_json
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.types import InputError, VideoSpec
 from tests.unit.annotate.stubs import config, textured_video, write
@@ -39,6 +45,25 @@ def test_joints_are_where_they_were_in_the_image(clip):
     u, v = project(action.cameras.intrinsics_px, local)
     assert (u[0] + 0.5) / 48 == pytest.approx((79 / 2 + 0.5) / 80)
     assert (v[0] + 0.5) / 32 == pytest.approx((47 / 2 + 0.5) / 48)
+
+
+def test_a_caption_by_the_rule_names_the_hands_of_its_own_clip(clip, tmp_path):
+    folder = tmp_path / "cup"
+    shutil.copytree(clip, folder)
+    about = read_json(folder / ANNOTATION)
+    about["caption"] = {"source": RULE, "names": ["a cup"]}
+    write_json(folder / ANNOTATION, about)
+    arrays = dict(np.load(folder / "action.npz"))
+    hands = np.full_like(arrays["joints_m"], np.nan)
+    hands[:4, 0] = arrays["joints_m"][:4, 1]  # the next clip begins with frame 4
+    arrays["joints_m"] = hands
+    np.savez(folder / "action.npz", **arrays)
+    first, second, *_ = episode_from(folder, SMALL).actions
+    assert first.prompt == "The wearer's left hand moves in view of a camera near a cup."
+    assert second.prompt == "A wearer looks at a scene without moving hands in view near a cup."
+    about["caption"]["source"] = "--caption"
+    write_json(folder / ANNOTATION, about)
+    assert episode_from(folder, SMALL).actions[1].prompt == about["row"]["prompt"]
 
 
 def test_all_clips_are_taken_by_default_and_more_are_refused(clip):
