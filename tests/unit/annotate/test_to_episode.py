@@ -47,7 +47,7 @@ def test_joints_are_where_they_were_in_the_image(clip):
     assert (v[0] + 0.5) / 32 == pytest.approx((47 / 2 + 0.5) / 48)
 
 
-def test_a_caption_by_the_rule_names_the_hands_of_its_own_clip(clip, tmp_path):
+def test_a_caption_by_the_rule_names_the_hands_that_a_clip_shows(clip, tmp_path):
     folder = tmp_path / "cup"
     shutil.copytree(clip, folder)
     about = read_json(folder / ANNOTATION)
