@@ -218,7 +218,7 @@ def add_caption(record: Record, estimators: Estimators, config: AnnotateConfig) 
         prompt, source = estimators.captioner(record.frames)[0], config.caption or "network"
     else:
         human = record.recording.kind == "human"
-        seen = [bool(s) for s in visible(record.require("hands")).any(axis=0)] if human else []
+        seen = np.asarray(visible(record.require("hands")).any(axis=0)).tolist() if human else []
         prompt, source = caption_by_rule(seen, names, record.recording.kind), RULE
     return record.add("caption", {"source": source, "names": names}, prompt=prompt)
 

@@ -100,7 +100,7 @@ def _caption(about: Mapping[str, Any], prompt: str, joints_m: np.ndarray, kind: 
         return prompt
     names = made.get("names")
     known = [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
-    seen = [bool(present) for present in np.isfinite(joints_m).all(axis=(2, 3)).any(axis=0)]
+    seen = np.asarray(np.isfinite(joints_m).all(axis=(2, 3)).any(axis=0)).tolist()
     return caption_by_rule(seen, known, kind)
 
 
