@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
+from egosim_jax.io.bounded import listing
 from egosim_jax.perception.estimates import ChosenRung
 from egosim_jax.rendering import RendererName
 from egosim_jax.runtime.command import ExitCode, HelpGroups
@@ -164,11 +165,14 @@ class Annotate:
         counts = report["clips"]
         empty = {name: video for name, video in report["videos"].items() if not video["done"]}
         for name, video in report["videos"].items():
-            clips = (about for about in report["annotations"] if about["source"] == name)
-            reasons = [video.get("problem"), *(about.get("reason") for about in clips)]
-            about = "no clip" if name in empty else "not every clip"
-            for reason in dict.fromkeys(filter(None, reasons)):
-                print(printable(f"{name}: {about}: {reason}"), file=sys.stderr)
+            if "problem" in video:
+                print(printable(f"{name}: no clip: {video['problem']}"), file=sys.stderr)
+        reasons: dict[str, list[str]] = {}
+        for about in report["annotations"]:
+            if about.get("reason"):
+                reasons.setdefault(about["reason"], []).append(about["video_id"])
+        for reason, names in reasons.items():
+            print(printable(f"{listing(names)}: no annotation: {reason}"), file=sys.stderr)
         cameras = [about["cameras"] for about in report["annotations"] if about.get("cameras")]
         assumed = [found for found in cameras if found["focal_source"] == "assumed"]
         if assumed:
@@ -180,7 +184,8 @@ class Annotate:
             )
         print(
             f"{counted(counts['done'], 'clip')} done, {counts['refused']} refused, "
-            f"{counts['failed']} failed, of {counted(len(report['videos']), 'video')}; "
+            f"{counts['failed']} failed; of {counted(len(report['videos']), 'video')}, "
+            f"{len(empty)} without a clip; "
             f"see {self.out / 'index.html'}",
             file=sys.stderr,
         )

@@ -44,7 +44,7 @@ def test_a_video_without_clips_is_named_with_its_reason(video, tmp_path, capsys)
     shown = capsys.readouterr().err
     assert "bad: no clip: " in shown
     assert "is empty" in shown
-    assert "1 clip done, 0 refused, 0 failed, of 2 videos" in shown
+    assert "1 clip done, 0 refused, 0 failed; of 2 videos, 1 without a clip" in shown
 
 
 @pytest.mark.parametrize("options", [[], ["--focal", "120"]])
