@@ -1,4 +1,4 @@
-"""Objects of an annotation: what a hand moves, and what stands on a measured surface."""
+"""Find the objects of an annotated clip: moved by hands, or standing on a measured surface."""
 
 from __future__ import annotations
 
