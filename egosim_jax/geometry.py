@@ -108,6 +108,12 @@ def rotation_z(radians: float) -> Float[np.ndarray, "3 3"]:
     return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
 
 
+def rotation_angles_deg(a_from_b: Float[np.ndarray, "*b 4 4"]) -> Float[Any, "*b"]:
+    """Return the angle of the rotation of each rigid transform, in degrees."""
+    cosines = (np.trace(a_from_b[..., :3, :3], axis1=-2, axis2=-1) - 1) / 2
+    return np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+
+
 def hinge_rotation(
     axis: Float[np.ndarray, " 3"], point: Float[np.ndarray, " 3"], radians: float
 ) -> Float[np.ndarray, "4 4"]:

@@ -86,7 +86,9 @@ def annotate(
         record = _run_stages(job, out, config, estimators, notes, first_only=first_only)
         if record is None:
             return "started"
-        with phase(f"{job.video_id}: writes the clip", only_if_long=True):
+        last = len(STAGES) + 1
+        about = f"{job.video_id}: draws and writes the clip, stage {last} of {last}"
+        with phase(about, only_if_long=True):
             _write(job, out, config, record, notes)
         status = "done"
     except RefusedError as refused:
@@ -181,10 +183,11 @@ def _run_stages(
         return None
     record = open_record(job, config)
     times = notes.setdefault("seconds", {})
-    for stage in chosen:
+    for number, stage in enumerate(chosen, start=1):
         cv2.setRNGSeed(config.seed % 2**31)  # per stage: a resumed clip gets the same results
         then = time.monotonic()
-        with phase(f"{job.video_id}: {stage.name}", only_if_long=True):
+        about = f"{job.video_id}: {stage.name}, stage {number} of {len(STAGES) + 1}"
+        with phase(about, only_if_long=True):
             if stage.stored:
                 record = _stored(journal, folder, stage, record, estimators, config)
                 times[stage.name] = journal.done[stage.name]["seconds"]

@@ -12,11 +12,20 @@ from typing import Any
 from egosim_jax.annotate.clip import SHEET
 from egosim_jax.io.bounded import own_file, read_bytes
 from egosim_jax.io.run import write_text
+from egosim_jax.runtime.terminal import counted
 
 PAGE = "index.html"
 MAX_IMAGES = 500
 """Maximum number of clips shown with images; further clips are only listed."""
 MAX_SHEET_BYTES = 1 << 24
+MIN_FILLED = 0.005
+"""Share of the first frame's pixels from which a filled place is named."""
+FILLED_IN = (
+    "the clip begins with hands in view. The scene behind them is filled in, and parts of sleeves "
+    "may stay in it: look at the prior. Begin without hands in view, or mask them by a network. "
+    "(--masks)"
+)
+"""What to know of a scene with filled places."""
 _HEAD = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>Annotated clips</title>
 <style>
@@ -30,12 +39,26 @@ h2 { font-size: 16px; margin: 4px 0 }
 """
 
 
+def summary(report: Mapping[str, Any]) -> str:
+    """Return the numbers of clips and videos of a report, by their result."""
+    counts, videos = report["clips"], report["videos"].values()
+    return (
+        f"{counted(counts['done'], 'clip')} done, {counts['refused']} refused, "
+        f"{counts['failed']} failed; of {counted(len(videos), 'video')}, "
+        f"{sum(not video['done'] for video in videos)} without a clip"
+    )
+
+
+def filled_in(about: Mapping[str, Any]) -> bool:
+    """Return True if a clip's first frame has a place behind hands that no other frame shows."""
+    return about["status"] == "done" and about.get("plate", {}).get("filled", 0) > MIN_FILLED
+
+
 def write_page(out: Path, report: Mapping[str, Any]) -> None:
     """Write the page: self-contained, without scripts, with escaped text."""
-    counts = report["clips"]
     parts = [
         _HEAD,
-        f"<h1>{counts['done']} clips, {counts['refused']} refused, {counts['failed']} failed</h1>",
+        f"<h1>{html.escape(summary(report))}</h1>",
         "<p>Images, from top to bottom: prior, mask (white: not observed), hands, video.</p>",
     ]
     for name, video in report["videos"].items():
@@ -46,6 +69,8 @@ def write_page(out: Path, report: Mapping[str, Any]) -> None:
         drawn = own_file(out, name) if number < MAX_IMAGES else None
         title = f"{about['video_id']}: {about['status']}"
         text = about.get("reason") or about.get("row", {}).get("prompt", "")
+        if filled_in(about):
+            text = f"{text} Note: {FILLED_IN}"
         shown = ("quality", "hands", "cameras", "depth", "scale", "plate", "prior", "caption")
         figures = {name: about[name] for name in shown if name in about}
         parts.append(_section(about["status"], title, text, drawn, figures))

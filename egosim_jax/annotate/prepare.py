@@ -92,6 +92,10 @@ class Cutting:
     quality: Quality = field(default_factory=Quality)
     """Quality rules for clips."""
 
+    def advice(self, parts: str) -> str:
+        """Return the advice to annotate parts of a video; empty if videos are cut already."""
+        return "" if self.clips else f"Annotate the parts {parts} (--clips). "
+
 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)

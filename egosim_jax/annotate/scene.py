@@ -150,6 +150,7 @@ def clean_first_frame(record: Record, estimators: Estimators, config: AnnotateCo
         "hand_px": int(record.moving[0].sum()),
         "seen_px": int(plate.seen.sum()),
         "filled_by": plate.method,
+        "filled": round(float(plate.filled.mean()), 4),
     }
     return record.add("plate", notes, first_frame=plate.image)
 
@@ -318,8 +319,8 @@ def check_prior(rung: Rung, figures: Mapping[str, float], config: AnnotateConfig
             "prior",
             f"prior: the PSNR of the background is {unlike(shown, MIN_FIXED_DB, '.1f')} dB, below "
             f"{MIN_FIXED_DB:g} dB: the camera seems fixed ({rung}), but the scene changes, as in a "
-            "recording of a screen. Choose another camera method (--rung), annotate other parts "
-            "(--clips), or allow it by --min-prior-gain=-inf. (--min-prior-gain)",
+            f"recording of a screen. {config.cutting.advice('whose scene stays')}Choose another "
+            "camera method (--rung), or allow it by --min-prior-gain=-inf. (--min-prior-gain)",
             figures,
         )
 

@@ -19,7 +19,7 @@ import numpy as np
 from einops import rearrange
 
 from egosim_jax.annotate.captions import SIDES
-from egosim_jax.annotate.config import AnnotateConfig, Estimators, Side
+from egosim_jax.annotate.config import AnnotateConfig, Estimators
 from egosim_jax.annotate.frames import read_searched_frames
 from egosim_jax.annotate.hand_tracks import (
     MAX_BOTH,
@@ -90,11 +90,11 @@ def find_hands(record: Record, estimators: Estimators, config: AnnotateConfig) -
         raise RefusedError(
             "hands",
             f"hands: visible in {shown} of {len(seen)} frames, less than "
-            f"{limit:.0%}. Annotate the parts that show hands (--clips), or allow fewer. "
+            f"{limit:.0%}. {config.cutting.advice('that show hands')}A lower limit allows fewer. "
             "(--min-hands)",
             {"visible": share},
         )
-    _check_sides(hands, seen, config.side)
+    _check_sides(hands, seen, config)
     return record.add("hands", notes, hands=hands)
 
 
@@ -113,9 +113,9 @@ def search_hands(record: Record, estimators: Estimators) -> HandTracks:
     return without(replace(found, joints_px=joints_px), visible(found) & ~inside)
 
 
-def _check_sides(hands: HandTracks, seen: np.ndarray, side: Side) -> None:
+def _check_sides(hands: HandTracks, seen: np.ndarray, config: AnnotateConfig) -> None:
     """Raise `RefusedError` if the side of a hand is often ambiguous and was not given."""
-    if hands.mirrored is None or side != "auto":
+    if hands.mirrored is None or config.side != "auto":
         return
     shares = hands.mirrored.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
     if (worst := float(shares.max())) > MAX_MIRRORED:
@@ -125,7 +125,8 @@ def _check_sides(hands: HandTracks, seen: np.ndarray, side: Side) -> None:
             f"{unlike(100 * worst, 100 * MAX_MIRRORED, '.0f')}% of its frames, more than "
             f"{MAX_MIRRORED:.0%}: its fingers are hidden. "
             + (
-                "Annotate the parts in which they are visible. (--clips, --num-frames)"
+                f"{config.cutting.advice('in which they are visible')}Shorter clips may show them. "
+                "(--num-frames)"
                 if share_of_both(seen) > MAX_BOTH
                 else "Give the side if there is one hand. (--side)"
             ),

@@ -162,8 +162,10 @@ class Annotate:
         return annotate_on_ray(jobs, self.out, config, address=self.ray, gpus=gpus, actors=actors)
 
     def _finish(self, report: dict) -> int:
+        from egosim_jax.annotate.gallery import FILLED_IN, filled_in, summary
+
         counts = report["clips"]
-        empty = {name: video for name, video in report["videos"].items() if not video["done"]}
+        empty = [name for name, video in report["videos"].items() if not video["done"]]
         for name, video in report["videos"].items():
             if "problem" in video:
                 print(printable(f"{name}: no clip: {video['problem']}"), file=sys.stderr)
@@ -182,13 +184,9 @@ class Annotate:
                 "of the video, if you know it. (--focal)",
                 file=sys.stderr,
             )
-        print(
-            f"{counted(counts['done'], 'clip')} done, {counts['refused']} refused, "
-            f"{counts['failed']} failed; of {counted(len(report['videos']), 'video')}, "
-            f"{len(empty)} without a clip; "
-            f"see {self.out / 'index.html'}",
-            file=sys.stderr,
-        )
+        if filled := [a["video_id"] for a in report["annotations"] if filled_in(a)]:
+            print(printable(f"{listing(filled)}: {FILLED_IN}"), file=sys.stderr)
+        print(f"{summary(report)}; see {self.out / 'index.html'}", file=sys.stderr)
         print(self.out)
         return ExitCode.PARTIAL if empty or counts["failed"] else ExitCode.DONE
 

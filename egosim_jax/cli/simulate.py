@@ -20,6 +20,7 @@ from egosim_jax.rendering.rerun_log import RECORDING, Recording
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.runtime.phases import phase
 from egosim_jax.runtime.terminal import printable
+from egosim_jax.simulation.changes import MovedObject, moved_objects
 from egosim_jax.types import InputError, Kind, VideoSpec, check_counts, check_seed
 
 if TYPE_CHECKING:
@@ -129,7 +130,8 @@ class Simulate:
         count = len(episode.actions)
         print(f"{folder}: {count} clips by {self.config}", file=sys.stderr, flush=True)
         made_on = configs.trained_on(self.config, weights)
-        if note := configs.scene_warning(made_on, episode.state.provenance):
+        note = configs.scene_warning(made_on, episode.state.provenance)
+        if note:
             print(note, file=sys.stderr, flush=True)
         outputs = _Outputs(folder, episode)
         generator = Generator.load(config, weights, renderer=rendering.get(self.renderer))
@@ -147,7 +149,8 @@ class Simulate:
         )
         truths = self._ground_truth(episode, config.video)
         report = outputs.write(simulator, steps, truths)
-        write_json(folder / "report.json", {"definitions": DEFINITIONS, "clips": report})
+        about = {"definitions": DEFINITIONS, "notes": [note] if note else [], "clips": report}
+        write_json(folder / "report.json", about)
         if self.episode is None or episode.ground_truth:
             _print(report)
         print(folder / "contact_sheet.png")
@@ -274,12 +277,14 @@ class _Outputs:
                 self._write_state(0, state)
                 if find_spec("rerun"):
                     recording = Recording(folder / RECORDING, folder.name, up=up)
+            moved = moved_objects(state, step.state)
             with phase(f"clip {self.number}: scores and draws", only_if_long=True):
                 report.append(
                     {
                         "clip": self.number,
                         "action": action.prompt,
                         "notes": list(step.notes),
+                        "moved": [asdict(found) for found in moved],
                         **({} if step.latency is None else asdict(step.latency)),
                         **_score(simulator, step, action, truth),
                     }
@@ -293,8 +298,8 @@ class _Outputs:
                     frames=step.clip.frames,
                     ground_truth=truth and truth.frames,
                 )
+            self._print_step(step, action, moved, seconds=time.monotonic() - then)
             state = step.state
-            self._print_step(step, action, seconds=time.monotonic() - then)
             self.number, self.shown, then = self.number + 1, [], time.monotonic()
         if recording is not None:
             recording.close(state)
@@ -302,7 +307,9 @@ class _Outputs:
         draw_sheet(sheet, folder / "contact_sheet.png", moments=moments)
         return report
 
-    def _print_step(self, step: Step, action: Action, *, seconds: float) -> None:
+    def _print_step(
+        self, step: Step, action: Action, moved: Sequence[MovedObject], *, seconds: float
+    ) -> None:
         about = f"clip {self.number}/{len(self.episode.actions)}: {action.prompt}"
         times = f"{seconds:.1f} s"
         if not self.shown:
@@ -311,8 +318,8 @@ class _Outputs:
             first, last = step.latency.first_frame_s, step.latency.last_frame_s
             times += f"; first frame after {first:.1f} s, last after {last:.1f} s"
         print(printable(f"{about} ({times})"), file=sys.stderr)
-        for note in step.notes:
-            print(printable(f"  {note}"), file=sys.stderr)
+        for line in (*step.notes, *moved):
+            print(printable(f"  {line}"), file=sys.stderr)
 
     def _write_step(
         self, simulator: Simulator, step: Step, action: Action, truth: GroundTruth | None

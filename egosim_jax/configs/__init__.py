@@ -172,6 +172,7 @@ def scene_warning(world: str | None, provenance: Mapping[str, str]) -> str | Non
         return None
     return (
         f"The weights were trained on clips of the {world} world, and this scene is not of it: "
-        f"expect poor clips. Train on your own clips ({_module('real_tiny').TRAINING}), or fetch "
-        "EgoSim's weights (egosim models fetch egosim_14b) for --config egosim_14b."
+        "expect blurred clips, whose objects may stay or turn where a hand carries them. Train on "
+        f"your own clips ({_module('real_tiny').TRAINING}), or fetch EgoSim's weights (egosim "
+        "models fetch egosim_14b) for --config egosim_14b."
     )

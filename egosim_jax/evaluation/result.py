@@ -30,6 +30,8 @@ KNOWN = {
 """Columns that published rows may have without being measured here."""
 SHOWN = ("psnr", "ssim", "lpips_alex")
 """Default columns of printed tables; files have all columns."""
+FEW_CLIPS = 5
+"""Number of clips below which the reader is told that intervals are wide."""
 Summaries = Mapping[str, Mapping[str, Mapping[str, Any]]]
 """Number of clips, mean and spread of each measure by group and method."""
 
@@ -250,6 +252,14 @@ class Evaluation:
             "reading: an interval without 0 shows a difference; a model that is no better than the "
             "baselines (prior, first frame repeated) does no better than copying",
         ]
+        fewest = min(
+            rows["clips"] for found in self.summaries().values() for rows in found.values()
+        )
+        if self.differences() and fewest < FEW_CLIPS:
+            lines.append(
+                f"reading: {counted(fewest, 'clip')} of a method are few: intervals of fewer than "
+                f"{FEW_CLIPS} clips are wide, or missing, and decide little"
+            )
         lines += [
             f"{key}: {text}"
             for key, text in self.definitions.items()

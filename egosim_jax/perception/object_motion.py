@@ -269,7 +269,9 @@ def _best_candidate(
                 moved += [ranked] if ranked else []
             found.append(moved[choose_extent([r[0] for r in moved], growths, *scene)])
     if best := best_of(found, *scene):
-        return best, ""
+        name = object_name(best[1].model.number, state.names)
+        unsure = f"seems to have moved {name}: its fingers do not show when they held it"
+        return best, "" if grip.sure else unsure
     if clusters and grip.sure:
         note = "closed on something without an id that the clip shows at rest"
     return None, note

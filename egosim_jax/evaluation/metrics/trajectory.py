@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from egosim_jax.geometry import invert, pixel_rays, transform
+from egosim_jax.geometry import invert, pixel_rays, rotation_angles_deg, transform
 from egosim_jax.types import Cameras
 
 MAX_KEYPOINTS = 800
@@ -108,7 +108,7 @@ def camera_errors(
         return float("nan"), float("nan")
     between = invert(target[known]) @ world_from_camera[known]
     meters = np.linalg.norm(between[:, :3, 3], axis=1)
-    return _rms(meters), _rms(_angles_deg(between))
+    return _rms(meters), _rms(rotation_angles_deg(between))
 
 
 class PathErrors(NamedTuple):
@@ -139,7 +139,7 @@ def path_errors(
     strength = np.square(here).sum()
     scale = max((here * there).sum() / strength, 0.0) if strength else 1.0
     return PathErrors(
-        rotation_deg=_rms(_angles_deg(between)),
+        rotation_deg=_rms(rotation_angles_deg(between)),
         translation=_rms(np.linalg.norm(here / _extent(here) - there / _extent(there), axis=1)),
         ate=_rms(np.linalg.norm(scale * here - there, axis=1)),
     )
@@ -149,12 +149,6 @@ def _extent(positions: Float[np.ndarray, "f 3"]) -> float:
     """Return the maximum distance from the first camera, or 1 for a camera that does not move."""
     extent = float(np.linalg.norm(positions, axis=1).max())
     return extent if extent > MIN_EXTENT else 1.0
-
-
-def _angles_deg(a_from_b: Float[np.ndarray, "f 4 4"]) -> Float[np.ndarray, " f"]:
-    """Return the angle of each rotation in degrees."""
-    cosines = (np.trace(a_from_b[:, :3, :3], axis1=1, axis2=2) - 1) / 2
-    return np.degrees(np.arccos(np.clip(cosines, -1, 1)))
 
 
 def _rms(values: Float[np.ndarray, " n"]) -> float:

@@ -13,6 +13,7 @@ from egosim_jax.annotate import clip as clips
 from egosim_jax.annotate import run
 from egosim_jax.annotate.clip import ANNOTATION
 from egosim_jax.annotate.frames import Sampling
+from egosim_jax.annotate.gallery import FILLED_IN, filled_in, summary
 from egosim_jax.annotate.prepare import Cutting, Quality
 from egosim_jax.annotate.sources import find_sources
 from egosim_jax.data.clips import check_clip
@@ -84,6 +85,21 @@ def test_an_annotation_says_what_was_chosen(video, tmp_path):
     assert "data:image/jpeg" in page
     assert "<script" not in page
     assert not (out / "work/cup").exists()
+
+
+def test_the_page_says_what_became_of_videos_and_of_the_scene_behind_hands(video, tmp_path):
+    out, broken = tmp_path / "out", tmp_path / "broken.mp4"
+    broken.write_bytes(b"no video")
+    report = annotate([video, broken], out)
+    line = "1 clip done, 0 refused, 0 failed; of 2 videos, 1 without a clip"
+    assert summary(report) == line
+    page = (out / "index.html").read_text()
+    assert f"<h1>{line}</h1>" in page
+    (about,) = report["annotations"]
+    assert 0 < about["plate"]["filled"] < 1
+    assert filled_in(about) == (FILLED_IN in page)
+    for filled, named in ((0.0, False), (0.2, True)):
+        assert filled_in({**about, "plate": {"filled": filled}}) == named
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from egosim_jax.annotate.clip import Job, open_record
 from egosim_jax.annotate.frames import Sampling
 from egosim_jax.annotate.hand_tracks import drop_flashes, hold_hands, visible
 from egosim_jax.annotate.objects import find_moved_objects, join_objects, measured
-from egosim_jax.annotate.prepare import RefusedError
+from egosim_jax.annotate.prepare import Cutting, RefusedError
 from egosim_jax.annotate.scene import (
     STAGES,
     check_prior,
@@ -90,6 +90,25 @@ def test_the_prior_of_a_fixed_camera_is_checked_too(rung):
     with pytest.raises(RefusedError, match=r"12\.0 dB, below 16 dB.*a screen.*--rung"):
         check_prior(rung, changing, config())
     check_prior("incremental", changing, config())
+
+
+def test_clips_are_not_advised_to_be_cut_into_clips(tmp_path):
+    """Every refusal that names `--clips` omits it if the videos are cut already."""
+    cut = Cutting(clips=True)
+    changing = {"psnr_background": 12.0, "psnr_first_frame": 12.0, "psnr_drawn": 100.0}
+    record = stages_of(tmp_path, config(), last="hands")
+    for hands in (StubHands(0.0, None), TwoHands(9, mirrored=9)):
+        for cutting, advised in ((Cutting(), True), (cut, False)):
+            settings = config(sampling=Sampling(num_frames=9), cutting=cutting)
+            with pytest.raises(RefusedError) as refused:
+                find_hands(record, replace(settings.build(), hands=hands), settings)
+            assert ("--clips" in str(refused.value)) == advised
+    for cutting, advised in ((Cutting(), True), (cut, False)):
+        with pytest.raises(RefusedError) as refused:
+            check_prior(
+                "static", changing, config(sampling=Sampling(num_frames=9), cutting=cutting)
+            )
+        assert ("--clips" in str(refused.value)) == advised
 
 
 def test_moved_objects_are_joined_by_other_objects():
@@ -223,7 +242,7 @@ class TwoHands:
     [
         (TwoHands(9), "left", r"two are visible in 100% of the frames.*Omit it\. \(--side\)"),
         (TwoHands(5), "right", r"two are visible in 56%"),
-        (TwoHands(9, mirrored=9), "auto", r"the left hand .* 100% of.*\(--clips, --num-frames\)"),
+        (TwoHands(9, mirrored=9), "auto", r"left hand .* 100% of.*\(--clips\).*\(--num-frames\)"),
         (MirroredHands(9), "auto", r"Give the side if there is one hand\. \(--side\)"),
     ],
     ids=["side of two", "side of two in half", "mirrored of two", "mirrored of one"],
