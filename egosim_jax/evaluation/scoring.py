@@ -149,6 +149,12 @@ class Scoring:
                 raise InputError(f"There is no folder {folder.path}. (--generated)")
             results = read_results(folder.path)
             if results is None:
+                if (folder.path / "state_0.ply").exists():
+                    raise InputError(
+                        f"{folder.path} is a simulation: its report.json has the scores of its "
+                        "clips, if the episode has ground truth. Give a folder of egosim generate, "
+                        "whose clips have the ids of the metadata. (--generated)"
+                    )
                 done = {"start": 0, "status": "done"}
                 results = {name: {"source_id": name, **done} for name in rows}
             for output_id, line in results.items():

@@ -56,6 +56,15 @@ FORMAT, VERSION = "egosim_jax.episode", 1
 DESCRIPTION, FIRST_FRAME = "episode.json", "first_frame.png"
 MAX_CLIPS, MAX_BYTES = 1000, 1 << 32
 """Maximum number of clips of an episode, and maximum size of the byte format in bytes."""
+OTHERS = {
+    "annotation.json": "an annotated clip: egosim episode from-annotation {0} --out EPISODE",
+    "metadata.csv": "a folder of clips. Make an episode of one that `egosim data annotate` wrote: "
+    "egosim episode from-annotation {0}/CLIP --out EPISODE",
+    "meta/info.json": "a LeRobot dataset: egosim episode from-lerobot {0} --out EPISODE",
+    "session.json": "a session: `save` on the page of egosim play writes its episode.zip",
+    "contact_sheet.png": "a simulation, which reads an episode and writes none",
+}
+"""Folders that are taken for an episode, by a file in them, and what makes an episode of them."""
 _NAMES = re.compile(r"episode\.json|first_frame\.png|state/(?:points\.npz|state\.json)"
                     r"|clip_[1-9]\d{0,3}/(?:action|ground_truth)\.npz")  # fmt: skip
 
@@ -151,6 +160,10 @@ class Episode:
         """Read a folder or a .zip. Raises `InputError` if it is damaged or not valid."""
         path = Path(path)
         data = None if path.is_dir() else read_bytes(path, limit=MAX_BYTES)  # names the path
+        if data is None and not (path / DESCRIPTION).exists():
+            other = next((text for name, text in OTHERS.items() if (path / name).exists()), "")
+            hint = f" It is {other.format(quote_path(path))}." if other else ""
+            raise InputError(f"{quote_path(path)} is no episode: it has no {DESCRIPTION}.{hint}")
         with _named(quote_path(path)):
             return _read(path) if data is None else cls.from_bytes(data)
 

@@ -159,6 +159,12 @@ def test_evaluate_reports_the_generated_clips_along_with_the_baselines(generated
     assert "PSNR" in capsys.readouterr().out
 
 
+def test_a_simulation_is_not_evaluated_but_has_its_scores(clips, tmp_path, capsys):
+    (tmp_path / "state_0.ply").touch()
+    assert main(["evaluate", "--generated", str(tmp_path), "--metadata", str(clips)]) == 2
+    assert "is a simulation" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -182,6 +182,25 @@ def test_a_description_that_is_not_valid_is_refused(hands, tmp_path, field, valu
         Episode.load(tmp_path / "episode")
 
 
+@pytest.mark.parametrize(
+    ("file", "message"),
+    [
+        ("nothing.txt", r"is no episode: it has no episode\.json\.$"),
+        ("annotation.json", "an annotated clip: egosim episode from-annotation .*taken"),
+        ("metadata.csv", r"a folder of clips.*from-annotation .*taken/CLIP"),
+        ("meta/info.json", "a LeRobot dataset: egosim episode from-lerobot .*taken"),
+        ("session.json", "a session: `save`"),
+        ("contact_sheet.png", "a simulation"),
+    ],
+)
+def test_a_folder_that_is_no_episode_is_named(tmp_path, file, message):
+    path = tmp_path / "taken" / file
+    path.parent.mkdir(parents=True)
+    path.touch()
+    with pytest.raises(InputError, match=message):
+        Episode.load(tmp_path / "taken")
+
+
 def archive(entries, compression=zipfile.ZIP_STORED):
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", compression) as file:
