@@ -25,7 +25,7 @@ FILLED_IN = (
     "may stay in it: look at the prior. Begin without hands in view, or mask them by a network. "
     "(--masks)"
 )
-"""What to know of a scene with filled places."""
+"""Note on a scene with filled places."""
 _HEAD = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>Annotated clips</title>
 <style>

@@ -31,7 +31,7 @@ KNOWN = {
 SHOWN = ("psnr", "ssim", "lpips_alex")
 """Default columns of printed tables; files have all columns."""
 FEW_CLIPS = 5
-"""Number of clips below which the reader is told that intervals are wide."""
+"""Number of clips below which a note says that intervals are wide."""
 Summaries = Mapping[str, Mapping[str, Mapping[str, Any]]]
 """Number of clips, mean and spread of each measure by group and method."""
 

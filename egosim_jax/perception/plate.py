@@ -45,7 +45,7 @@ class CleanPlate:
     filled: Bool[np.ndarray, "h w"]
     """Hidden pixels that no frame shows: they are inpainted."""
     method: Inpainter
-    """Inpainting method of the filled pixels; `none` if there are none."""
+    """Inpainting method of the filled pixels; `none` without them."""
 
 
 def clean_plate(

@@ -1,4 +1,4 @@
-"""What a clip changed in the state: the objects that moved."""
+"""Objects that moved from one state to the next."""
 
 from __future__ import annotations
 

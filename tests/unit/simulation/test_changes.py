@@ -1,4 +1,4 @@
-"""What a clip changed: the objects that moved."""
+"""Objects that moved from one state to the next."""
 
 from dataclasses import replace
 
