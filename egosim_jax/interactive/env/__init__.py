@@ -80,8 +80,8 @@ def load_backend(
     generator = Generator.load(model, folder, mesh=mesh)
     unit = parts("batch", mesh)
     batcher = Batcher(generator, max_batch=max(batch, unit), unit=unit)
-    for size in batcher.sizes if compile else ():
-        generator.compile(size, streamed=True)
+    if compile:
+        generator.compile(*batcher.sizes, streamed=True)
     return GeneratedWorld(
         generator=batcher,
         video=model.video,
