@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import errno
 import io
 import logging
@@ -27,6 +26,7 @@ from typing import (
 )
 
 from egosim_jax.runtime import interrupts
+from egosim_jax.runtime.options import meant, show_options
 from egosim_jax.runtime.phases import show_phases
 from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import InputError
@@ -107,7 +107,7 @@ def main(
         about = f"{description} --version prints the version."
         command = _parse(commands, given, program, about)
         _refuse_empty(command)
-        with context(), show_phases():
+        with context(), show_phases(), show_options(command):
             code = command.run()
         if args is None:
             interrupts.ignore()  # the process ends: there is nothing to continue
@@ -249,9 +249,7 @@ def _mistyped(
         below = get_type_hints(known[args[0]], include_extras=True).get("command")
         return _mistyped(below, args[1:], f"{program} {args[0]}") if below else None
     names = [*known, *others]
-    near = difflib.get_close_matches(args[0], names, n=1, cutoff=0.6)
-    meant = f" Did you mean {near[0]}?" if near else ""
-    return f"{program} has no command {args[0]!r}.{meant} All: {', '.join(names)}."
+    return f"{program} has no command {args[0]!r}.{meant(args[0], names)} All: {', '.join(names)}."
 
 
 def run_with_exit_codes(run: Callable[[], int]) -> int:

@@ -190,7 +190,7 @@ def with_action(**changes):
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_another_run_in_the_same_folder_is_refused_with_both_values(finished, changes, field):
-    with pytest.raises(InputError, match=rf"{field}: recorded '.*', given '.*'"):
+    with pytest.raises(InputError, match=rf"{field}: the folder has '.*', this run has '.*'"):
         list(run_with(finished, **changes))
 
 
