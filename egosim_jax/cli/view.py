@@ -54,10 +54,11 @@ class View:
             print(page)
             return ExitCode.DONE
         if (self.path / JOURNAL).exists():
+            install = "" if find_spec("rerun") else "pip install 'egosim-jax[viewer]' and "
             raise InputError(
-                f"{self.path} has no {RECORDING}: it was simulated without Rerun. Install it (pip "
-                "install 'egosim-jax[viewer]') and run the same egosim simulate again, which adds "
-                f"it; or look at one state: {self.path / 'clip_1' / 'state'}."
+                f"{self.path} has no {RECORDING}, which egosim simulate writes where Rerun is "
+                f"installed: {install}run the same command again, which adds it; or look at one "
+                f"state: {self.path / 'state_0.ply'}."
             )
         if self.path.is_dir() and stages_of(self.path):
             print(write_page(self.path, self.out))

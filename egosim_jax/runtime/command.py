@@ -74,7 +74,7 @@ Fields without a group come first: the few that users change.
 
 
 Writes = Literal["folder", "file", "folder or .zip file"]
-"""What a command writes to --out: its attribute `writes`, by default a folder."""
+"""Kind of --out that a command writes: its attribute `writes`, by default a folder."""
 
 
 @runtime_checkable
