@@ -19,7 +19,7 @@ from egosim_jax.rendering.portrait import write_portrait
 from egosim_jax.rendering.rerun_log import RECORDING, Recording
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.runtime.phases import phase
-from egosim_jax.runtime.terminal import printable
+from egosim_jax.runtime.terminal import counted, printable
 from egosim_jax.types import InputError, Kind, VideoSpec, check_counts, check_seed
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ class Simulate:
         free = ["simulate.weights", "simulate.first_frame", "simulate.episode"]
         open_folder(folder, made_of, mutable=free)
         count = len(episode.actions)
-        print(f"{folder}: {count} clips by {self.config}", file=sys.stderr, flush=True)
+        print(f"{folder}: {counted(count, 'clip')} by {self.config}", file=sys.stderr, flush=True)
         made_on = configs.trained_on(self.config, weights)
         if note := configs.scene_warning(made_on, episode.state.provenance):
             print(note, file=sys.stderr, flush=True)
