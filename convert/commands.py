@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
@@ -223,6 +223,7 @@ class Lora:
     any prefix. A setting that changes the meaning is applied or refused.
     """
 
+    writes: ClassVar[command.Writes] = "file"
     source: Annotated[Path, tyro.conf.Positional]
     """LoRA file, or its folder with PEFT's config or with full weights (DWM)."""
     config: str

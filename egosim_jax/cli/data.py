@@ -6,7 +6,7 @@ import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 
@@ -15,7 +15,7 @@ from egosim_jax.cli.export import Export
 from egosim_jax.cli.imports import Import
 from egosim_jax.cli.triplets import Align, FromCaches, Mix, Static, ToDwm
 from egosim_jax.data.clip_files import Prompts
-from egosim_jax.runtime.command import ExitCode
+from egosim_jax.runtime.command import ExitCode, Writes
 from egosim_jax.runtime.progress import track
 from egosim_jax.runtime.terminal import make_console, printable
 from egosim_jax.types import WAN_GRID, InputError, VideoGrid, VideoSpec, check_counts
@@ -291,6 +291,7 @@ class Check:
 class Look:
     """Draw a contact sheet of shards of videos or frames. Prints its path."""
 
+    writes: ClassVar[Writes] = "file"
     shards: Path
     """Folder of the shards."""
     out: Path

@@ -5,12 +5,12 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
 from egosim_jax.rendering import RendererName
-from egosim_jax.runtime.command import ExitCode
+from egosim_jax.runtime.command import ExitCode, Writes
 from egosim_jax.types import InputError, check_counts, check_seed, object_name
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ class MakeEpisode:
     Objects can move: --objects finds them in the image, and their names and sizes are printed.
     """
 
+    writes: ClassVar[Writes] = "folder or .zip file"
     out: Path
     """Folder to write, or a file whose name ends in .zip."""
     config: str = "tabletop"
@@ -183,6 +184,7 @@ class FromAnnotation:
     video before annotation.
     """
 
+    writes: ClassVar[Writes] = "folder or .zip file"
     clip: Annotated[Path, tyro.conf.Positional]
     """Folder of the annotated clip."""
     out: Path
@@ -211,6 +213,7 @@ class FromLeRobot:
     videos, import and annotate a video instead (docs/video.md).
     """
 
+    writes: ClassVar[Writes] = "folder or .zip file"
     dataset: Annotated[Path, tyro.conf.Positional]
     """Folder of the dataset, with meta/info.json."""
     out: Path
@@ -276,6 +279,7 @@ class ShowEpisode:
     row of the ground truth if there is one.
     """
 
+    writes: ClassVar[Writes] = "file"
     path: Annotated[Path, tyro.conf.Positional]
     """Folder or .zip of the episode."""
     out: Path | None = None

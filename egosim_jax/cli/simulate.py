@@ -19,7 +19,7 @@ from egosim_jax.rendering.portrait import write_portrait
 from egosim_jax.rendering.rerun_log import RECORDING, Recording
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.runtime.phases import phase
-from egosim_jax.runtime.terminal import printable
+from egosim_jax.runtime.terminal import counted, printable
 from egosim_jax.simulation.changes import MovedObject, moved_objects
 from egosim_jax.types import InputError, Kind, VideoSpec, check_counts, check_seed
 
@@ -128,7 +128,7 @@ class Simulate:
         free = ["simulate.weights", "simulate.first_frame", "simulate.episode"]
         open_folder(folder, made_of, mutable=free)
         count = len(episode.actions)
-        print(f"{folder}: {count} clips by {self.config}", file=sys.stderr, flush=True)
+        print(f"{folder}: {counted(count, 'clip')} by {self.config}", file=sys.stderr, flush=True)
         made_on = configs.trained_on(self.config, weights)
         note = configs.scene_warning(made_on, episode.state.provenance)
         if note:

@@ -6,10 +6,10 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from egosim_jax.data.clip_files import Prompts
-from egosim_jax.runtime.command import ExitCode
+from egosim_jax.runtime.command import ExitCode, Writes
 from egosim_jax.runtime.progress import track
 from egosim_jax.runtime.terminal import make_console, printable
 from egosim_jax.types import InputError, check_counts
@@ -110,6 +110,7 @@ class Align:
     --most-px. Videos must agree in length and size. Exit code 3 if a clip is skipped.
     """
 
+    writes: ClassVar[Writes] = "file"
     metadata: Path
     """CSV or JSONL with EgoSim's columns, including video; or a DWM list (.txt)."""
     where: str | None = None

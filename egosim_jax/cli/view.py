@@ -7,7 +7,7 @@ import sys
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
@@ -15,7 +15,7 @@ from egosim_jax.geometry import Up, up_of
 from egosim_jax.io.journal import NAME as JOURNAL
 from egosim_jax.rendering.portrait import write_portrait
 from egosim_jax.rendering.rerun_log import RECORDING
-from egosim_jax.runtime.command import ExitCode
+from egosim_jax.runtime.command import ExitCode, Writes
 from egosim_jax.runtime.terminal import printable
 from egosim_jax.train.run_page import PAGE, stages_of, write_page
 from egosim_jax.types import InputError
@@ -33,6 +33,7 @@ class View:
     run, finished or not. The page shows curves, sample clips and settings.
     """
 
+    writes: ClassVar[Writes] = "file"
     path: Annotated[Path, tyro.conf.Positional]
     """Folder or file to view."""
     out: Path | None = None
@@ -53,10 +54,11 @@ class View:
             print(page)
             return ExitCode.DONE
         if (self.path / JOURNAL).exists():
+            install = "" if find_spec("rerun") else "pip install 'egosim-jax[viewer]' and "
             raise InputError(
-                f"{self.path} has no {RECORDING}: it was simulated without Rerun. Install it (pip "
-                "install 'egosim-jax[viewer]') and run the same egosim simulate again, which adds "
-                f"it; or look at one state: {self.path / 'clip_1' / 'state'}."
+                f"{self.path} has no {RECORDING}, which egosim simulate writes where Rerun is "
+                f"installed: {install}run the same command again, which adds it; or look at one "
+                f"state: {self.path / 'state_0.ply'}."
             )
         if self.path.is_dir() and stages_of(self.path):
             print(write_page(self.path, self.out))

@@ -18,7 +18,6 @@ results.
 from __future__ import annotations
 
 import csv
-import difflib
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -27,6 +26,7 @@ from typing import Any
 from egosim_jax.data.clip_files import MAX_CLIPS, SAFE_IDS, ClipFiles, Problems, Prompts, is_safe_id
 from egosim_jax.data.dwm import read_list
 from egosim_jax.io.bounded import quote, quote_path, quote_text, read_bytes, read_lines
+from egosim_jax.runtime.options import meant
 from egosim_jax.types import InputError, check_counts
 
 REQUIRED = ("ego_prior_video", "prompt")
@@ -118,8 +118,7 @@ def select(
         by_id = {item.video_id: item for item in chosen}
         for video_id in video_ids:
             if video_id not in by_id:
-                near = difflib.get_close_matches(video_id, by_id, n=1)
-                hint = f" Did you mean {near[0]}?" if near else ""
+                hint = meant(video_id, by_id)
                 raise InputError(f"No clip has the id {video_id}.{hint} (--video-id)")
         chosen = [by_id[video_id] for video_id in video_ids]
     if limit is not None:

@@ -56,14 +56,16 @@ class CompiledFn:
         with self._on_mesh():
             return self._jit.trace(self._params, *self._placed(args))
 
-    def compile(self, *args: Any, about: str = "") -> Any:
-        """Compile for these arguments, arrays or shapes, or load it from the cache.
+    def compile(self, *args: Any, about: str = "") -> bool:
+        """Compile for these arguments, arrays or shapes; return True if the cache had it.
 
         `about` names the function to the user, by default by its cache key.
         """
-        placed = self._placed(args)
+        placed, was_cached = self._placed(args), True
 
         def compile() -> Any:
+            nonlocal was_cached
+            was_cached = False
             return self._jit.lower(self._params, *placed).compile()
 
         with self._on_mesh():
@@ -74,7 +76,7 @@ class CompiledFn:
                 given, about = (self._params, placed), about or self._cache_key[0]
                 compiled = cached_compile(self._cache_key, given, compile, about=about)
         self._compiled[_signature(args)] = compiled
-        return compiled
+        return was_cached
 
     def shapes(self, *args: Any) -> Any:
         """Return the shapes and dtypes of the results."""

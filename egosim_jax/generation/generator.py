@@ -244,13 +244,21 @@ class Generator:
         else:
             yield "decode", self.decode, (noise,)
 
-    def compile(self, batch: int, *, streamed: bool = False) -> None:
-        """Compile all functions of `generate`, or of `groups`, for batches of this size."""
-        count = self.count_programs(streamed=streamed)
-        programs = self.programs(batch, streamed=streamed)
-        together = f" for {batch} clips at once" if batch > 1 else ""
-        for number, (name, program, inputs) in enumerate(programs, start=1):
-            program.compile(*inputs, about=f"{number} of {count}: {name}{together}")
+    def compile(self, *batches: int, streamed: bool = False) -> None:
+        """Compile all functions of `generate`, or of `groups`, for batches of each size.
+
+        One count numbers the functions of all sizes. Loading from the cache is silent, so the next
+        line says how many functions were loaded.
+        """
+        count = len(batches) * self.count_programs(streamed=streamed)
+        number = loaded = 0
+        for batch in batches:
+            together = f" for {batch} clips at once" if batch > 1 else ""
+            for name, program, inputs in self.programs(batch, streamed=streamed):
+                number += 1
+                before = f" (after {loaded} from the cache)" if loaded else ""
+                about = f"{number} of {count}: {name}{together}{before}"
+                loaded = loaded + 1 if program.compile(*inputs, about=about) else 0
 
     def count_programs(self, *, streamed: bool = False) -> int:
         """Return the number of `programs`, without tracing any."""

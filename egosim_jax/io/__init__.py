@@ -10,7 +10,8 @@ Readers of a dataset's layout belong to `data`, and conversion of other projects
 - images, colors: read_image, decode_image, decode_labels, read_depth_image; colors as sRGB
 - video, segments, decoding, boxes: read, probe and write videos
 - weights, mapped: save and load networks; memory-mapped safetensors
-- checkpoint, run, journal: training checkpoints, run folders, resumable phases
+- checkpoint, run, journal, differences: training checkpoints, run folders, resumable phases;
+  the differences of a refused run
 - parts: cut and join files of limited size
 - hub, wheels: download pinned weights and files
 - private, executables: cache of compiled programs that only its user can write

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from egosim_jax.io.bounded import quote_path, read_json
+from egosim_jax.runtime import interrupts
 from egosim_jax.types import InputError
 
 TEMPORARY = ".tmp"
@@ -187,6 +188,8 @@ def hold_folder(folder: Path, *, wait: bool = False) -> None:
     """Lock a folder (`lock_folder`) until the process ends."""
     folder.mkdir(parents=True, exist_ok=True)
     key = folder.resolve()
+    if not wait:  # a process waits only for a cache, which is no run
+        interrupts.resume_from(key)
     if key in _held:
         descriptor, holders = _held[key]
         _held[key] = descriptor, holders + 1

@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from egosim_jax.io.atomic import append_line
-from egosim_jax.io.bounded import listing, quote, read_lines
+from egosim_jax.io.bounded import quote, read_lines
+from egosim_jax.io.differences import describe
 from egosim_jax.io.digest import sha256
 from egosim_jax.types import InputError
 
@@ -67,15 +68,15 @@ class Journal:
             self._append({"phase": phase, "made_of": dict(made_of)})
             return
         recorded = self.done[phase]["made_of"]
-        differing = [
-            f"{name}: recorded {quote(recorded.get(name))}, given {quote(made_of.get(name))}"
+        differing = {
+            name: (quote(recorded.get(name)), quote(made_of.get(name)))
             for name in sorted(recorded.keys() | made_of.keys())
             if recorded.get(name) != made_of.get(name)
-        ]
+        }
         if differing:
             raise InputError(
                 f"{self._folder} holds another run (phase {phase} in {NAME}). Choose another "
-                f"folder, or pass the recorded inputs: {listing(differing)}."
+                f"--out, or the same inputs: {describe(differing)}."
             )
 
     def phase(

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from egosim_jax.io.atomic import atomic_write, hold_folder
-from egosim_jax.io.bounded import MAX_QUOTED, listing, quote, quote_text, read_json
+from egosim_jax.io.bounded import MAX_QUOTED, quote, quote_text, read_json
+from egosim_jax.io.differences import describe
 from egosim_jax.types import InputError
 
 CONFIG, ENVIRONMENT = "config.json", "environment.json"
@@ -151,21 +152,20 @@ def _compare(folder: Path, config: Any, mutable: Collection[str]) -> None:
         recorded = read_json(path)
         if not isinstance(recorded, dict):
             raise InputError(f"{path} is not a config. Restore it. (--out)")
-        differences = _differences(recorded, wanted)
-        differing = [  # the short ones, such as a seed, before digests
-            f"{field}: {difference}"
-            for field, difference in sorted(differences.items(), key=lambda item: len(item[1]))
+        differing = {
+            field: values
+            for field, values in _differences(recorded, wanted).items()
             if not any(f"{field}.".startswith(f"{free}.") for free in mutable)
-        ]
+        }
         if differing:
             raise InputError(
                 f"{folder} holds a run of another config. Choose another --out, or the same "
-                f"config: {listing(differing)}."
+                f"config: {describe(differing)}."
             )
 
 
-def _differences(recorded: Any, wanted: Any, path: str = "") -> dict[str, str]:
-    """Return the differences by dotted path, `out` fields excluded."""
+def _differences(recorded: Any, wanted: Any, path: str = "") -> dict[str, tuple[str, str]]:
+    """Return the two values where configs differ, by dotted path, `out` fields excluded."""
     if isinstance(recorded, dict) and isinstance(wanted, dict):
         found = {}
         for key in recorded.keys() | wanted.keys():
@@ -185,7 +185,7 @@ def _differences(recorded: Any, wanted: Any, path: str = "") -> dict[str, str]:
     equal = next((n for n, (a, b) in enumerate(zip(one, other, strict=False)) if a != b), 0)
     begin = equal - MAX_QUOTED // 4 if equal > MAX_QUOTED // 2 else 0  # to show the difference
     one, other = (f"{'…' * (begin > 0)}{quote_text(text[begin:])}" for text in (one, other))
-    return {path: f"the folder has {one}, this run has {other}"}
+    return {path: (one, other)}
 
 
 def _shown(value: Any) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import errno
 import io
 import logging
@@ -16,10 +15,12 @@ from contextlib import AbstractContextManager, nullcontext, redirect_stderr
 from dataclasses import MISSING, fields, is_dataclass, replace
 from enum import IntEnum
 from importlib import metadata
+from pathlib import Path
 from typing import (
     TYPE_CHECKING,
     Annotated,
     Any,
+    Literal,
     Protocol,
     get_args,
     get_type_hints,
@@ -27,6 +28,7 @@ from typing import (
 )
 
 from egosim_jax.runtime import interrupts
+from egosim_jax.runtime.options import meant, show_options
 from egosim_jax.runtime.phases import show_phases
 from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import InputError
@@ -48,6 +50,8 @@ class ExitCode(IntEnum):
     """Training made no progress within its timeout."""
     RESUBMIT = 75
     """Training was interrupted and saved: run the same command again."""
+    INTERRUPTED = interrupts.CODE
+    """Ctrl-C; the message says how to continue if there are results."""
 
 
 class CommandExit(Exception):  # noqa: N818 - an early exit need not be an error
@@ -67,6 +71,10 @@ HelpGroups = Mapping[str, tuple[str, ...]]
 
 Fields without a group come first: the few that users change.
 """
+
+
+Writes = Literal["folder", "file", "folder or .zip file"]
+"""Kind of --out that a command writes: its attribute `writes`, by default a folder."""
 
 
 @runtime_checkable
@@ -107,7 +115,8 @@ def main(
         about = f"{description} --version prints the version."
         command = _parse(commands, given, program, about)
         _refuse_empty(command)
-        with context(), show_phases():
+        _refuse_file(command)
+        with context(), show_phases(), show_options(command):
             code = command.run()
         if args is None:
             interrupts.ignore()  # the process ends: there is nothing to continue
@@ -125,6 +134,25 @@ def _refuse_empty(command: Any) -> None:
         elif value == () and field.default != () and field.default_factory is MISSING:
             name = field.name.replace("_", "-")
             raise InputError(f"--{name} has no value: give one or more, or omit it. (--{name})")
+
+
+def _refuse_file(command: Any) -> None:
+    """Raise `InputError` if --out, or a folder above it, is a file where a folder has to be."""
+    for field in fields(command):
+        value = getattr(command, field.name)
+        if is_dataclass(value):
+            _refuse_file(value)
+        elif field.name == "out" and isinstance(value, Path):
+            writes: Writes = getattr(command, "writes", "folder")
+            may_be_file = writes == "file" or (writes != "folder" and value.suffix == ".zip")
+            for path in value.parents if may_be_file else (value, *value.parents):
+                if os.path.exists(path) and not os.path.isdir(path):
+                    problem = (
+                        f"--out must be a {writes}, new or of the same run"
+                        if path == value
+                        else f"{value} cannot be written"
+                    )
+                    raise InputError(f"{path} is a file: {problem}. Choose another path. (--out)")
 
 
 def _parse(commands: Any, args: Sequence[str], program: str, about: str) -> Command:
@@ -249,9 +277,7 @@ def _mistyped(
         below = get_type_hints(known[args[0]], include_extras=True).get("command")
         return _mistyped(below, args[1:], f"{program} {args[0]}") if below else None
     names = [*known, *others]
-    near = difflib.get_close_matches(args[0], names, n=1, cutoff=0.6)
-    meant = f" Did you mean {near[0]}?" if near else ""
-    return f"{program} has no command {args[0]!r}.{meant} All: {', '.join(names)}."
+    return f"{program} has no command {args[0]!r}.{meant(args[0], names)} All: {', '.join(names)}."
 
 
 def run_with_exit_codes(run: Callable[[], int]) -> int:
@@ -265,8 +291,8 @@ def run_with_exit_codes(run: Callable[[], int]) -> int:
         print(printable(early), file=sys.stderr)
         return early.code
     except KeyboardInterrupt:
-        interrupts.print_how_to_continue()
-        return ExitCode.FAILED
+        interrupts.print_interrupted()
+        return ExitCode.INTERRUPTED
     except Exception as error:
         if isinstance(error, BrokenPipeError) and _reader_ended():
             return ExitCode.FAILED

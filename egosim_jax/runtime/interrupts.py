@@ -1,4 +1,4 @@
-"""Ctrl-C at any time: print one line with the command that continues.
+"""Ctrl-C at any time: print one line, with the command that continues if there is work to keep.
 
 A program imports this module and calls `expect` before its large imports, which take seconds. So it
 imports only the standard library, and is not part of `command.py`.
@@ -11,7 +11,14 @@ import shlex
 import signal
 import sys
 from contextlib import suppress
+from pathlib import Path
 from types import FrameType
+
+CODE = 128 + signal.SIGINT
+"""Exit code after Ctrl-C, as of a program that the signal ends."""
+PREPARED = ("config.json", "environment.json", "journal.jsonl")
+"""Files of a run folder that are written before any result."""
+_folders: set[Path] = set()
 
 
 def expect() -> None:
@@ -26,8 +33,16 @@ def ignore() -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def print_how_to_continue() -> None:
-    """Print the command line that continues an interrupted run."""
+def resume_from(folder: Path) -> None:
+    """Remember that the command resumes from the results in a folder, if it has any."""
+    _folders.add(folder.absolute())
+
+
+def print_interrupted() -> None:
+    """Print that the command was interrupted, and the command line that continues its run."""
+    if not any(map(_has_results, _folders)):
+        print("interrupted", file=sys.stderr, flush=True)
+        return
     program, *options = sys.argv
     # `egosim train` is a program of two words (`cli/__main__.py`); others are paths.
     words = [program] if os.sep in program else program.split()
@@ -35,11 +50,20 @@ def print_how_to_continue() -> None:
     print(f"interrupted; to continue: {command}", file=sys.stderr, flush=True)
 
 
+def _has_results(folder: Path) -> bool:
+    """Return True if a folder has a file that was not only prepared."""
+    return any(
+        not name.startswith(".") and name not in PREPARED
+        for _, _, names in os.walk(folder)
+        for name in names
+    )
+
+
 def _interrupt(number: int, frame: FrameType | None) -> None:
     """Raise `KeyboardInterrupt`; exit during an import: half-imported libraries may crash."""
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
-            print_how_to_continue()
-            os._exit(1)
+            print_interrupted()
+            os._exit(CODE)
         frame = frame.f_back
     raise KeyboardInterrupt

@@ -22,6 +22,7 @@ from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.perception import archive
 from egosim_jax.rendering import POINT_PX, Renderer, reference
 from egosim_jax.runtime.phases import phase
+from egosim_jax.runtime.terminal import counted
 from egosim_jax.simulation.simulator import (
     ClipStream,
     FrameTimer,
@@ -57,10 +58,10 @@ class Rollout:
     ) -> Iterator[Step]:
         """Run one step per action, each from the state after the previous one.
 
-        The same call resumes an interrupted run. `first_frame` is the first frame of the first
-        clip. Step N uses `seed + N`, which must be a valid seed too. Raises `InputError` showing
-        both values if the folder holds a run of another state, action, generator, renderer,
-        perception or seed, and if another process writes to it.
+        The same call resumes an interrupted run, and yields its finished steps first. `first_frame`
+        is the first frame of the first clip. Step N uses `seed + N`, which must be a valid seed
+        too. Raises `InputError` showing both values if the folder holds a run of another state,
+        action, generator, renderer, perception or seed, and if another process writes to it.
         """
         check_seed(seed, name="seed")
         if isinstance(actions, Sized):  # fail before the first clip, not after hours
@@ -68,6 +69,9 @@ class Rollout:
         with lock_folder(self.folder):
             journal = Journal(self.folder, outputs=OUTPUTS)
             journal.require("run", self._inputs(state, seed, first_frame))
+            if made := sum(name.endswith(" generate") for name in journal.done):
+                with phase(f"{self.folder}: {counted(made, 'clip')} made before"):
+                    pass  # one line: a resumed run must not look like a new one
             for number, action in enumerate(actions, start=1):
                 check_seed(seed + number, name="seed + number of actions")
                 journal.require(f"{number} action", {"action": fingerprint(action)})

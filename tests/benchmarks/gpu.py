@@ -28,7 +28,7 @@ def compile_all(
 ) -> Iterator[tuple[str, Any, tuple]]:
     """Compile and yield the programs of a generator."""
     for name, program, given in generator.programs(clips):
-        timed(line, f"{name}_compile_s", lambda p=program, g=given: p.compile(*g) and None)
+        timed(line, f"{name}_compile_s", lambda p=program, g=given: p.compile(*g))
         yield name, program, given
 
 

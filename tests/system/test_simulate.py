@@ -71,7 +71,10 @@ def test_the_same_command_again_makes_nothing_new(simulated, weights):
 
 
 def test_a_folder_of_another_run_is_refused(simulated, weights, capsys):
-    for option, named in (("--seed", "seed"), ("--steps", "model.steps")):
+    for option, named in (
+        ("--seed", "seed"),
+        ("--steps", "--steps: the folder has 4, this run has 7"),
+    ):
         assert simulate(weights, simulated, option, "7") == 2
         assert named in capsys.readouterr().err
 

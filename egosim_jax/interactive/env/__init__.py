@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
+from egosim_jax.runtime.options import meant
 from egosim_jax.runtime.phases import phase, show_phases
 from egosim_jax.simulation.start import Start
 from egosim_jax.types import InputError
@@ -80,8 +81,8 @@ def load_backend(
     generator = Generator.load(model, folder, mesh=mesh)
     unit = parts("batch", mesh)
     batcher = Batcher(generator, max_batch=max(batch, unit), unit=unit)
-    for size in batcher.sizes if compile else ():
-        generator.compile(size, streamed=True)
+    if compile:
+        generator.compile(*batcher.sizes, streamed=True)
     return GeneratedWorld(
         generator=batcher,
         video=model.video,
@@ -118,8 +119,8 @@ def _check_options(env: type, options: Mapping[str, Any]) -> None:
     known = ["backend", "world", *(n for n in signature(env).parameters if n not in _POSITIONAL)]
     if unknown := [name for name in options if name not in known]:
         raise InputError(
-            f"There is no option {unknown[0]!r:.40} of an environment: choose from "
-            f"{', '.join(known)}."
+            f"There is no option {unknown[0]!r:.40} of an environment.{meant(unknown[0], known)} "
+            f"Options: {', '.join(known)}."
         )
 
 

@@ -167,7 +167,7 @@ def test_a_bad_video_that_was_replaced_is_annotated(tmp_path):
 
 def test_another_configuration_in_the_same_folder_is_refused(video, tmp_path):
     annotate([video], tmp_path / "out")
-    with pytest.raises(InputError, match=r"scale: recorded 'None', given '0\.5'"):
+    with pytest.raises(InputError, match=r"scale: the folder has 'None', this run has '0\.5'"):
         annotate([video], tmp_path / "out", config(scale=0.5))
 
 

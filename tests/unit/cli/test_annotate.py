@@ -1,6 +1,7 @@
 """`egosim data annotate` and `egosim episode from-annotation`."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -8,9 +9,12 @@ from egosim_jax.annotate import run
 from egosim_jax.annotate.clip import ANNOTATION
 from egosim_jax.annotate.config import AnnotateConfig
 from egosim_jax.cli.__main__ import main
+from egosim_jax.cli.annotate import Annotate
 from egosim_jax.io.bounded import read_json
+from egosim_jax.io.run import plain
 from egosim_jax.perception.cameras import CameraLadder
 from egosim_jax.runtime.command import ExitCode
+from egosim_jax.runtime.options import option_of, show_options
 from egosim_jax.simulation.episode import Episode
 from tests.unit.annotate.stubs import config, textured_video, write
 
@@ -87,3 +91,22 @@ def test_wrong_options_are_refused_before_any_work(video, tmp_path, capsys, opti
     assert code == ExitCode.USAGE
     assert message in capsys.readouterr().err
     assert not (out / "work").exists()
+
+
+def test_another_configuration_is_refused_by_the_options_as_they_are_typed(video, tmp_path, capsys):
+    again = ["data", "annotate", str(video), "--out", str(tmp_path / "out")]
+    assert main([*again, *OPTIONS]) == ExitCode.DONE
+    capsys.readouterr()
+    assert main([*again, *OPTIONS, "--min-hands", "0.25", "--focal", "90"]) == ExitCode.USAGE
+    said = capsys.readouterr().err
+    assert "Choose another --out, or the same inputs: --" in said
+    assert "--min-hands: the folder has '0.5', this run has '0.25'" in said
+    assert "--focal: the folder has 'None', this run has '90.0'" in said
+
+
+def test_every_field_of_a_configuration_has_an_option():
+    """But the threshold of shot changes, which no option sets."""
+    command = Annotate(videos=(Path("cup.mp4"),), out=Path("out"))
+    with show_options(command):
+        fields = run._flat(plain(command._config()))
+        assert [name for name in fields if option_of(name) is None] == ["cutting.cut_difference"]

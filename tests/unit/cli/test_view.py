@@ -10,7 +10,7 @@ from egosim_jax.types import InputError
     ("file", "message"),
     [
         ("report.json", "cannot be viewed: give the folder of a simulation"),  # of an experiment
-        ("journal.jsonl", "simulated without Rerun"),
+        ("journal.jsonl", "no simulation.rrd, which egosim simulate writes where Rerun is"),
         ("state.json", "not a readable state"),
     ],
 )
@@ -27,3 +27,19 @@ def test_a_page_that_exists_is_printed_and_not_written_elsewhere(tmp_path, capsy
     assert capsys.readouterr().out.strip() == str(tmp_path / "index.html")
     with pytest.raises(InputError, match="would not be written"):
         View(path=tmp_path, out=tmp_path / "other.html").run()
+
+
+@pytest.mark.parametrize("file", ["journal.jsonl", "simulation.rrd"])
+def test_without_rerun_the_extra_is_named(tmp_path, monkeypatch, file):
+    monkeypatch.setattr("egosim_jax.cli.view.find_spec", lambda name: None)
+    (tmp_path / file).touch()
+    with pytest.raises(InputError, match=r"pip install 'egosim-jax\[viewer\]'"):
+        View(path=tmp_path).run()
+
+
+def test_with_rerun_the_extra_is_not_named(tmp_path, monkeypatch):
+    monkeypatch.setattr("egosim_jax.cli.view.find_spec", lambda name: name)
+    (tmp_path / "journal.jsonl").touch()
+    with pytest.raises(InputError, match="run the same command again") as refused:
+        View(path=tmp_path).run()
+    assert "pip install" not in str(refused.value)

@@ -153,7 +153,7 @@ def test_a_full_disk_is_one_line(tmp_path, capsys, monkeypatch, name):
 def test_a_folder_that_cannot_be_written_to_is_one_line(tmp_path, capsys, name):
     (tmp_path / "file").write_text("", encoding="utf-8")
     args = commands(tmp_path)[name]
-    assert "file" in one_line(capsys, 1, *args, "--out", tmp_path / "file" / "out" / "x")
+    assert "file" in one_line(capsys, 2, *args, "--out", tmp_path / "file" / "out" / "x")
     assert "/proc" in one_line(capsys, 1, *args, "--out", "/proc/none/x")
 
 

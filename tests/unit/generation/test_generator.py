@@ -163,3 +163,32 @@ def test_the_tokenizer_of_the_release_is_in_its_weights_folder():
 def test_networks_that_do_not_fit_each_other_are_refused():
     with pytest.raises(InputError, match=r"dit\.text_dim is 64 but text\.dim is 4096"):
         ModelConfig(name="odd", video=CONFIG.video, dit=CONFIG.dit, vae=CONFIG.vae)
+
+
+def test_one_count_numbers_the_functions_of_all_batch_sizes(generator, monkeypatch):
+    """A cache with the first function of each size; loading it is silent."""
+    lines, seen = [], set()
+
+    def compile(program, *args, about):
+        lines.append(about)
+        was_cached = program is generator.encode
+        seen.add(was_cached)
+        return was_cached
+
+    monkeypatch.setattr(CompiledFn, "compile", compile)
+    generator.compile(1, 2)
+    assert seen == {True, False}
+    assert [line.split(" (")[0] for line in lines] == [
+        "1 of 8: encode",
+        "2 of 8: noise",
+        "3 of 8: denoise",
+        "4 of 8: decode",
+        "5 of 8: encode for 2 clips at once",
+        "6 of 8: noise for 2 clips at once",
+        "7 of 8: denoise for 2 clips at once",
+        "8 of 8: decode for 2 clips at once",
+    ]
+    assert [number for number, line in enumerate(lines, 1) if "after 1 from the cache" in line] == [
+        2,
+        6,
+    ]

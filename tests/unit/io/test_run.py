@@ -4,11 +4,13 @@ import json
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import pytest
 
 from egosim_jax.io import run
 from egosim_jax.io.run import open_folder, write_json
+from egosim_jax.runtime.options import show_options
 from egosim_jax.types import InputError, VideoSpec
 
 
@@ -66,6 +68,54 @@ def test_another_config_is_refused_naming_the_field_and_both_values(tmp_path):
     open_folder(tmp_path, config())
     with pytest.raises(InputError, match="seed: the folder has 0, this run has 1"):
         open_folder(tmp_path, config(seed=1))
+
+
+@dataclass(frozen=True)
+class Mesh:
+    data: int = 1
+
+
+@dataclass(frozen=True)
+class Command:
+    """A parsed command; the scene is a positional argument."""
+
+    scene: Annotated[str, "tyro.conf.Positional"] = ""
+    min_hands: float = 0.5
+    focal: float | None = None
+    steps: int = 4
+    mesh: Mesh = Mesh()
+
+
+def test_options_are_named_as_they_are_typed_before_digests(tmp_path):
+    def made_of(hands: float, steps: int, digest: str) -> dict:
+        return {
+            "weights": {"dit": 8 * digest},
+            "cutting": {"quality": {"min_hands": hands}},
+            "focal_px": hands,
+            "simulate": {"steps": steps, "scene": digest},
+            "model": {"steps": steps, "layers": steps},
+            "training": {"mesh": {"data": steps}},
+        }
+
+    open_folder(tmp_path, made_of(0.5, 4, "abcdef01"))
+    with show_options(Command()), pytest.raises(InputError) as refused:
+        open_folder(tmp_path, made_of(0.25, 9, "12345678"))
+    said = str(refused.value)
+    assert "Choose another --out" in said
+    shown = said.partition("same config: ")[2].removesuffix(".").split("; ")
+    assert {line.split(":")[0] for line in shown[:4]} == {
+        "--min-hands", "--focal", "--steps", "--mesh.data"
+    }  # fmt: skip
+    assert "--min-hands: the folder has 0.5, this run has 0.25" in shown
+    assert shown[4].startswith("model.layers: ")
+    assert shown[5] == "and 2 more"
+    assert "abcdef01abc" not in said
+
+
+def test_digests_are_cut_and_other_names_stay_without_a_command(tmp_path):
+    open_folder(tmp_path, {"a_b": 8 * "abcdef01"})
+    with pytest.raises(InputError, match=r"a_b: the folder has 'abcdef01…', this run has '1234"):
+        open_folder(tmp_path, {"a_b": 8 * "12345678"})
 
 
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path):

@@ -18,11 +18,13 @@ import egosim_jax
 from egosim_jax.cli.__main__ import main as egosim
 from egosim_jax.cli.annotate import Annotate
 from egosim_jax.cli.commands import Commands
+from egosim_jax.cli.episode import MakeEpisode, ShowEpisode
 from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.generate import Generate
 from egosim_jax.cli.serve import Serve
 from egosim_jax.cli.simulate import Simulate
 from egosim_jax.convert.__main__ import main as convert
+from egosim_jax.io.atomic import lock_folder
 from egosim_jax.runtime import command, interrupts
 from egosim_jax.train.__main__ import main as train
 from egosim_jax.train.config import TrainConfig
@@ -173,20 +175,81 @@ def test_too_little_memory_is_one_line(capsys):
         (["/my bin/egosim", "simulate"], "'/my bin/egosim' simulate"),
     ],
 )
-def test_the_line_that_continues_can_be_run(monkeypatch, capsys, argv, said):
+def test_the_line_that_continues_can_be_run(monkeypatch, capsys, tmp_path, argv, said):
+    (tmp_path / "result").touch()
+    monkeypatch.setattr(interrupts, "_folders", {tmp_path})
     monkeypatch.setattr(sys, "argv", argv)
-    interrupts.print_how_to_continue()
+    interrupts.print_interrupted()
     assert capsys.readouterr().err == f"interrupted; to continue: {said}\n"
 
 
-def test_ctrl_c_says_how_to_continue(monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (None, "interrupted\n"),
+        ("config.json", "interrupted\n"),
+        ("journal.jsonl", "interrupted\n"),
+        ("clip_1/.frames.tmp.npz", "interrupted\n"),
+        ("clip_1/frames.npz", "interrupted; to continue: egosim data make --out 'a folder'\n"),
+    ],
+)
+def test_ctrl_c_says_how_to_continue_only_if_there_are_results(
+    monkeypatch, capsys, tmp_path, made, said
+):
     def run():
-        raise KeyboardInterrupt
+        with lock_folder(tmp_path):
+            if made is not None:
+                (tmp_path / made).parent.mkdir(exist_ok=True)
+                (tmp_path / made).touch()
+            raise KeyboardInterrupt
 
+    monkeypatch.setattr(interrupts, "_folders", set())
     monkeypatch.setattr(sys, "argv", ["egosim", "data", "make", "--out", "a folder"])
-    assert command.run_with_exit_codes(run) == command.ExitCode.FAILED
-    said = "interrupted; to continue: egosim data make --out 'a folder'\n"
+    assert command.run_with_exit_codes(run) == command.ExitCode.INTERRUPTED == 130
     assert capsys.readouterr().err == said
+
+
+@pytest.mark.parametrize(
+    ("program", "args"),
+    [
+        (egosim, ["simulate"]),
+        (egosim, ["generate", "--config", "tabletop"]),
+        (egosim, ["serve"]),
+        (egosim, ["play"]),
+        (egosim, ["data", "annotate", "video.mp4"]),
+        (egosim, ["data", "make", "tabletop"]),
+        (egosim, ["episode", "make"]),
+        (egosim, ["experiment", "tabletop"]),
+        (train, ["debug"]),
+        (convert, ["to-torch", "weights"]),
+    ],
+    ids=lambda value: " ".join(value[:2]) if isinstance(value, list) else "",
+)
+def test_a_file_as_out_is_refused_before_any_work(program, args, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("README.md").write_text("mine", "utf-8")
+    for out in ("README.md", "README.md/below"):
+        if args[0] == "to-torch":
+            args = [*args[:2], "--config", "debug"]
+        assert program([*args, "--out", out]) == command.ExitCode.USAGE
+        said = capsys.readouterr().err
+        assert "error: README.md is a file" in said
+        assert "(--out)" in said
+    assert [path.name for path in tmp_path.iterdir()] == ["README.md"]
+
+
+def test_a_command_that_writes_a_file_replaces_one(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("sheet.png").touch()
+    assert egosim(["episode", "show", "none", "--out", "sheet.png"]) == command.ExitCode.USAGE
+    assert "sheet.png" not in capsys.readouterr().err
+    Path("episode.zip").touch()
+    refused = command._refuse_file
+    assert refused(MakeEpisode(out=Path("episode.zip"))) is None
+    with pytest.raises(InputError, match=r"a folder or \.zip file, new or of the same run"):
+        refused(MakeEpisode(out=Path("sheet.png")))
+    with pytest.raises(InputError, match=r"a file: sheet\.png/b cannot be written"):
+        refused(ShowEpisode(path=Path("none"), out=Path("sheet.png/b")))
 
 
 @pytest.mark.parametrize("words", ["generate --help", "--version", "convert --version"])

@@ -15,6 +15,7 @@ import pytest
 from egosim_jax.io.journal import Journal
 from egosim_jax.perception.oracle import OracleConfig
 from egosim_jax.rendering.reference import draw_hands
+from egosim_jax.runtime.phases import show_phases
 from egosim_jax.simulation.rollout import Rollout
 from egosim_jax.simulation.simulator import Simulator
 from egosim_jax.state.snapshot import fingerprint
@@ -165,6 +166,16 @@ def test_finished_phases_are_not_run_again(tmp_path):
         assert len(run(tmp_path, **parts)) == 2
 
 
+def test_a_resumed_run_says_how_many_clips_were_made_before(finished, tmp_path, capsys):
+    with show_phases():
+        run(finished)
+        assert f"{finished}: 2 clips made before\n" in capsys.readouterr().err
+        next(run_with(tmp_path / "new"))
+        assert "made before" not in capsys.readouterr().err
+        run(tmp_path / "new")
+        assert f"{tmp_path / 'new'}: 1 clip made before\n" in capsys.readouterr().err
+
+
 def noisier(view, action, first_frame, seed):
     return 255 - paint_the_hands(view, action, first_frame, seed)
 
@@ -190,7 +201,7 @@ def with_action(**changes):
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_another_run_in_the_same_folder_is_refused_with_both_values(finished, changes, field):
-    with pytest.raises(InputError, match=rf"{field}: recorded '.*', given '.*'"):
+    with pytest.raises(InputError, match=rf"{field}: the folder has '.*', this run has '.*'"):
         list(run_with(finished, **changes))
 
 
@@ -336,5 +347,5 @@ def test_a_run_that_updates_the_state_by_chunk_resumes_with_the_same_states(tmp_
     for step, before in zip(again, made, strict=True):
         np.testing.assert_array_equal(step.view.frames, before.view.frames)
         assert step.latency.last_frame_s == before.latency.last_frame_s
-    with pytest.raises(InputError, match="update_every: recorded"):
+    with pytest.raises(InputError, match="update_every: the folder has"):
         run(tmp_path, **{**changes, "update_every": "clip"})

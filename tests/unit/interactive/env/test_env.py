@@ -41,6 +41,14 @@ def test_gymnasiums_checker_passes(layout):
     check_env(env.unwrapped)
 
 
+def test_the_name_of_an_environment_can_name_its_module():
+    """It works in a program that imports nothing else of this package."""
+    name = f"egosim_jax.interactive.env:{egosim.ID}"
+    env = gymnasium.make(name, backend=painted(), disable_env_checker=True)
+    assert isinstance(env.unwrapped, WorldEnv)
+    assert isinstance(gymnasium.make_vec(name, num_envs=2, backend=painted()), WorldVectorEnv)
+
+
 def test_equal_seeds_and_actions_give_equal_states():
     infos = []
     for _ in range(2):

@@ -156,9 +156,9 @@ def test_the_advice_about_an_unknown_object_works():
 
 @pytest.mark.parametrize("vector", [False, True], ids=["single", "vector"])
 def test_an_unknown_option_is_refused_before_a_world_is_loaded(vector, capsys):
-    known = "choose from backend, world, actions, observe, reward, max_chunks"
+    known = "Did you mean world\\? Options: backend, world, actions, observe, reward, max_chunks"
     make = gymnasium.make_vec if vector else gymnasium.make
     count = {"num_envs": 2} if vector else {}
-    with pytest.raises(InputError, match=f"no option 'wrld' of an environment: {known}"):
+    with pytest.raises(InputError, match=f"no option 'wrld' of an environment. {known}"):
         make("egosim_jax/Tabletop-v0", wrld="true", **count)
     assert capsys.readouterr().err == ""
