@@ -68,7 +68,8 @@ class Launch:
             running.clear()
             running.extend(self._start())
             code = _wait(running)
-            can_resume = code in (ExitCode.HUNG, ExitCode.RESUBMIT) or code > 128
+            killed = code > 128 and code != ExitCode.INTERRUPTED  # whoever interrupts means it
+            can_resume = killed or code in (ExitCode.HUNG, ExitCode.RESUBMIT)
             if stops or not can_resume or not left:
                 return code
             print(f"a process ended with {code}; restarts left: {left}", file=sys.stderr)

@@ -70,6 +70,13 @@ def test_a_run_whose_process_is_killed_starts_again(tmp_path: Path):
     assert process.returncode == 0
 
 
+def test_a_run_whose_process_is_interrupted_does_not_start_again():
+    process = start("say('started'); sys.exit(130)")
+    out, _ = process.communicate(timeout=300)
+    assert process.returncode == 130
+    assert out == "[0] started\n"
+
+
 def test_restarts_are_limited():
     process = start("say('started'); sys.exit(75)", "--restarts", "1")
     out, errors = process.communicate(timeout=300)

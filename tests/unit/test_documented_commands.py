@@ -177,7 +177,11 @@ def test_pods_start_again_unless_they_would_fail_again():
         ]
         (rule,) = job(name)["podFailurePolicy"]["rules"]
         assert rule["action"] == "FailJob"
-        assert rule["onExitCodes"]["values"] == [ExitCode.FAILED, ExitCode.USAGE]
+        assert rule["onExitCodes"]["values"] == [
+            ExitCode.FAILED,
+            ExitCode.USAGE,
+            ExitCode.INTERRUPTED,
+        ]
         assert rule["onExitCodes"]["containerName"] == container(name)["name"]
         assert job(name)["template"]["spec"]["restartPolicy"] == "Never"
         assert job(name)["backoffLimit"] == 0
@@ -185,7 +189,15 @@ def test_pods_start_again_unless_they_would_fail_again():
 
 @pytest.mark.parametrize(
     ("code", "restarts", "requeued"),
-    [(0, 0, False), (2, 0, False), (70, 0, True), (75, 0, True), (137, 0, True), (75, 50, False)],
+    [
+        (0, 0, False),
+        (2, 0, False),
+        (70, 0, True),
+        (75, 0, True),
+        (137, 0, True),
+        (130, 0, False),
+        (75, 50, False),
+    ],
 )
 def test_slurm_starts_it_again_unless_it_would_fail_again(tmp_path, code, restarts, requeued):
     for program, text in {
