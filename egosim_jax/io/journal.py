@@ -76,7 +76,7 @@ class Journal:
         if differing:
             raise InputError(
                 f"{self._folder} holds another run (phase {phase} in {NAME}). Choose another "
-                f"--out, or the same inputs: {describe(differing)}."
+                f"folder (--out), or the same inputs: {describe(differing)}."
             )
 
     def phase(

@@ -99,7 +99,7 @@ def test_another_configuration_is_refused_by_the_options_as_they_are_typed(video
     capsys.readouterr()
     assert main([*again, *OPTIONS, "--min-hands", "0.25", "--focal", "90"]) == ExitCode.USAGE
     said = capsys.readouterr().err
-    assert "Choose another --out, or the same inputs: --" in said
+    assert "Choose another folder (--out), or the same inputs: --" in said
     assert "--min-hands: the folder has '0.5', this run has '0.25'" in said
     assert "--focal: the folder has 'None', this run has '90.0'" in said
 
