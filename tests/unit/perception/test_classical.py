@@ -152,6 +152,19 @@ def test_a_clip_that_leaves_an_object_at_rest_does_not_overrule_a_firm_grip(clip
     assert np.linalg.norm(gap) < 0.02
 
 
+def test_a_motion_is_uncertain_if_the_fingers_do_not_show_a_hold(clip, found):
+    assert found.notes == ()
+    action, rng = to_action(clip), np.random.default_rng(0)
+    noise = rng.normal(0, 0.004, action.joints_m.shape)  # as in a video
+    shaken = replace(action, joints_m=(action.joints_m + noise).astype(action.joints_m.dtype))
+    seen = ClassicalConfig().build()(Clip(frames=clip.frames, fps=8), shaken, clip.state)
+    assert set(seen.world_from_object) == {clip.body_ids[clip.target]}
+    (note,) = seen.notes
+    assert note.endswith(
+        f"seems to have moved {clip.target}: its fingers do not show when they held it"
+    )
+
+
 def test_without_hands_nothing_is_found(clip):
     action = to_action(clip)
     missing = replace(action, joints_m=np.full_like(action.joints_m, np.nan))
