@@ -18,14 +18,14 @@ PAGE = "index.html"
 MAX_IMAGES = 500
 """Maximum number of clips shown with images; further clips are only listed."""
 MAX_SHEET_BYTES = 1 << 24
-MIN_FILLED = 0.005
-"""Share of the first frame's pixels from which a filled place is named."""
-FILLED_IN = (
-    "the clip begins with hands in view. The scene behind them is filled in, and parts of sleeves "
-    "may stay in it: look at the prior. Begin without hands in view, or mask them by a network. "
-    "(--masks)"
+MIN_HIDDEN = 0.005
+"""Share of the first frame's pixels from which hidden places are named."""
+HIDDEN = (
+    "the clip begins with hands in view. The scene behind them is taken from other frames or "
+    "filled in, and parts of hands and sleeves may stay in it: look at the prior. Begin without "
+    "hands in view, or mask them by a network. (--masks)"
 )
-"""Note on a scene with filled places."""
+"""Note on a scene with hidden places."""
 _HEAD = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>Annotated clips</title>
 <style>
@@ -49,9 +49,9 @@ def summary(report: Mapping[str, Any]) -> str:
     )
 
 
-def filled_in(about: Mapping[str, Any]) -> bool:
-    """Return True if a clip's first frame has a place behind hands that no other frame shows."""
-    return about["status"] == "done" and about.get("plate", {}).get("filled", 0) > MIN_FILLED
+def hides_scene(about: Mapping[str, Any]) -> bool:
+    """Return True if hands hide a part of the scene in a clip's first frame."""
+    return about["status"] == "done" and about.get("plate", {}).get("hidden", 0) > MIN_HIDDEN
 
 
 def write_page(out: Path, report: Mapping[str, Any]) -> None:
@@ -69,8 +69,8 @@ def write_page(out: Path, report: Mapping[str, Any]) -> None:
         drawn = own_file(out, name) if number < MAX_IMAGES else None
         title = f"{about['video_id']}: {about['status']}"
         text = about.get("reason") or about.get("row", {}).get("prompt", "")
-        if filled_in(about):
-            text = f"{text} Note: {FILLED_IN}"
+        if hides_scene(about):
+            text = f"{text} Note: {HIDDEN}"
         shown = ("quality", "hands", "cameras", "depth", "scale", "plate", "prior", "caption")
         figures = {name: about[name] for name in shown if name in about}
         parts.append(_section(about["status"], title, text, drawn, figures))

@@ -7,7 +7,7 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, UInt8
 
 from egosim_jax.annotate.config import Side
 from egosim_jax.annotate.prepare import RefusedError
@@ -22,6 +22,12 @@ HOLD_S = 0.5
 """Time in seconds for which the silhouette of a lost hand is kept."""
 GAP_S = 1.5
 """Longest gap in seconds in which the silhouette moves from one detection to the next."""
+
+
+OTHER_LEVELS, OTHER_SHARE = 25, 0.8
+"""Minimum difference in 8-bit levels, and minimum share of the pixels of a hand that have it, if
+the image shows something else. A hand that moved for 0.1 s changes at most 0.74 of them, a hand
+that is not there yet 0.98 (30 frames per second, lift_tumbler)."""
 
 
 def visible(hands: HandTracks) -> Bool[np.ndarray, "f 2"]:
@@ -85,6 +91,29 @@ def hold_hands(hands: HandTracks, fps: Fraction) -> HandTracks:
             gaps[start:stop, side] = within and stop + 1 - start <= GAP_S * fps
     joints_px, joints_hand_m = (fill_gaps(joints, gaps) for joints in (joints_px, joints_hand_m))
     return replace(hands, joints_px=joints_px, joints_hand_m=joints_hand_m)
+
+
+def before_entry(
+    hands: HandTracks, frames: UInt8[np.ndarray, "f h w 3"]
+) -> Bool[np.ndarray, "f 2"]:
+    """Return True for hands that are not in the first frame, but enter soon after.
+
+    The first frame shows something else where the hand is found first. Its silhouette must not be
+    kept there (`hold_hands`): nothing is hidden, and pixels of the hand would be taken for it.
+    """
+    import cv2
+
+    found, absent = visible(hands), np.zeros((len(frames), 2), bool)
+    for side in (LEFT, RIGHT):
+        known = np.flatnonzero(found[:, side])
+        if not len(known) or known[0] == 0:
+            continue
+        at, inside = int(known[0]), np.zeros(frames.shape[1:3], np.uint8)
+        outline = cv2.convexHull(hands.joints_px[at, side].astype(np.int32))
+        cv2.fillConvexPoly(inside, outline, 1)
+        change = cv2.absdiff(frames[0], frames[at]).max(axis=-1)[inside > 0]
+        absent[0, side] = len(change) > 0 and (change > OTHER_LEVELS).mean() >= OTHER_SHARE
+    return absent
 
 
 def on_side(hands: HandTracks, side: Side) -> HandTracks:

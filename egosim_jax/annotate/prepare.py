@@ -63,6 +63,19 @@ class Quality:
     min_prior_gain_db: float = -2.0
     """Minimum PSNR of the prior minus PSNR of the repeated first frame, in decibels."""
 
+    def __post_init__(self) -> None:
+        """Check that fractions are from 0 to 1, and other limits numbers that can be reached."""
+        for name, most in (
+            ("min_hands", 1.0), ("max_black", 1.0), ("min_sharpness", np.inf),
+            ("min_motion", np.inf), ("max_motion", np.inf),
+        ):  # fmt: skip
+            if not 0 <= (value := getattr(self, name)) <= most:
+                option = "--" + name.replace("_", "-")
+                bound = "at least 0" if np.isinf(most) else f"a fraction from 0 to {most:g}"
+                raise InputError(f"{option} is {value:g}: it must be {bound}. ({option})")
+        if np.isnan(self.min_prior_gain_db):
+            raise InputError("--min-prior-gain is nan: it must be a number. (--min-prior-gain)")
+
     def check(self, figures: Mapping[str, float]) -> None:
         """Raise `RefusedError` for the first rule that a clip breaks."""
         for rule, name, sign, option, fix in (

@@ -150,7 +150,7 @@ def clean_first_frame(record: Record, estimators: Estimators, config: AnnotateCo
         "hand_px": int(record.moving[0].sum()),
         "seen_px": int(plate.seen.sum()),
         "filled_by": plate.method,
-        "filled": round(float(plate.filled.mean()), 4),
+        "hidden": round(float(record.moving[0].mean()), 4),
     }
     return record.add("plate", notes, first_frame=plate.image)
 

@@ -23,6 +23,7 @@ from egosim_jax.annotate.config import AnnotateConfig, Estimators
 from egosim_jax.annotate.frames import read_searched_frames
 from egosim_jax.annotate.hand_tracks import (
     MAX_BOTH,
+    before_entry,
     drop_flashes,
     hold_hands,
     on_side,
@@ -157,7 +158,9 @@ def draw_silhouettes(record: Record, estimators: Estimators, config: AnnotateCon
     else:
         from egosim_jax.perception.silhouettes import track_silhouettes
 
-        moving = track_silhouettes(record.frames, hold_hands(record.hands, record.fps))
+        held = hold_hands(record.hands, record.fps)
+        absent = before_entry(record.hands, record.frames)
+        moving = track_silhouettes(record.frames, without(held, absent))
     ids = np.where(moving, -1, 0).astype(np.int32)
     return record.add("silhouettes", {"masks": "geometry"}, object_ids=ids, names={})
 

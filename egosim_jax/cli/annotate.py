@@ -162,7 +162,7 @@ class Annotate:
         return annotate_on_ray(jobs, self.out, config, address=self.ray, gpus=gpus, actors=actors)
 
     def _finish(self, report: dict) -> int:
-        from egosim_jax.annotate.gallery import FILLED_IN, filled_in, summary
+        from egosim_jax.annotate.gallery import HIDDEN, hides_scene, summary
 
         counts = report["clips"]
         empty = [name for name, video in report["videos"].items() if not video["done"]]
@@ -184,8 +184,8 @@ class Annotate:
                 "of the video, if you know it. (--focal)",
                 file=sys.stderr,
             )
-        if filled := [a["video_id"] for a in report["annotations"] if filled_in(a)]:
-            print(printable(f"{listing(filled)}: {FILLED_IN}"), file=sys.stderr)
+        if hidden := [a["video_id"] for a in report["annotations"] if hides_scene(a)]:
+            print(printable(f"{listing(hidden)}: {HIDDEN}"), file=sys.stderr)
         print(f"{summary(report)}; see {self.out / 'index.html'}", file=sys.stderr)
         print(self.out)
         return ExitCode.PARTIAL if empty or counts["failed"] else ExitCode.DONE

@@ -42,10 +42,8 @@ class CleanPlate:
     image: UInt8[np.ndarray, "h w 3"]
     seen: Bool[np.ndarray, "h w"]
     """Hidden pixels that other frames show."""
-    filled: Bool[np.ndarray, "h w"]
-    """Hidden pixels that no frame shows: they are inpainted."""
     method: Inpainter
-    """Inpainting method of the filled pixels; `none` without them."""
+    """Inpainting method of the other hidden pixels; `none` if there are no others."""
 
 
 def clean_plate(
@@ -90,7 +88,7 @@ def clean_plate(
         image[rows[taken], columns[taken]] = np.clip(colors[taken] * gain + 0.5, 0, 255)
         missing[rows[taken], columns[taken]] = False
     image, method = _inpaint(image, missing, carried & ~missing)
-    return CleanPlate(image=image, seen=hide[0] & ~missing, filled=missing, method=method)
+    return CleanPlate(image=image, seen=hide[0] & ~missing, method=method)
 
 
 def _look_up(

@@ -130,7 +130,7 @@ def test_a_lost_stage_is_trained_again_to_equal_weights(weights, run):
 
 def test_another_config_is_refused(weights, run, capsys):
     assert main(experiment(weights, run, "--lora.learning-rate", "0.5")) == 2
-    assert "experiment.lora.learning_rate" in capsys.readouterr().err
+    assert "--lora.learning-rate: the folder has 0.01, this run has 0.5" in capsys.readouterr().err
 
 
 def test_an_invalid_stage_is_refused_before_clips_are_made(weights, tmp_path, capsys):

@@ -60,7 +60,11 @@ def test_an_episode_without_ground_truth_is_simulated_but_not_scored(weights, tm
     given = ["--episode", str(tmp_path / "bare")]
     assert simulate(weights, tmp_path / "run", *given, "--clips", "1") == 0
     clips = clips_of(tmp_path / "run")
-    assert clips == [{"clip": 1, "action": episode.actions[0].prompt, "notes": []}]
+    (clip,) = clips
+    ((moved,),) = [clip.pop("moved")]
+    assert clip == {"clip": 1, "action": episode.actions[0].prompt, "notes": []}
+    assert moved["name"] in clip["action"]
+    assert moved["moved_mm"] > 100
     assert probe_video(tmp_path / "run" / "clip_1_cmp.mp4").width == 3 * 96
     assert (tmp_path / "run" / "contact_sheet.png").exists()
 

@@ -13,7 +13,7 @@ from egosim_jax.annotate import clip as clips
 from egosim_jax.annotate import run
 from egosim_jax.annotate.clip import ANNOTATION
 from egosim_jax.annotate.frames import Sampling
-from egosim_jax.annotate.gallery import FILLED_IN, filled_in, summary
+from egosim_jax.annotate.gallery import HIDDEN, hides_scene, summary
 from egosim_jax.annotate.prepare import Cutting, Quality
 from egosim_jax.annotate.sources import find_sources
 from egosim_jax.data.clips import check_clip
@@ -96,10 +96,10 @@ def test_the_page_says_what_became_of_videos_and_of_the_scene_behind_hands(video
     page = (out / "index.html").read_text()
     assert f"<h1>{line}</h1>" in page
     (about,) = report["annotations"]
-    assert 0 < about["plate"]["filled"] < 1
-    assert filled_in(about) == (FILLED_IN in page)
-    for filled, named in ((0.0, False), (0.2, True)):
-        assert filled_in({**about, "plate": {"filled": filled}}) == named
+    assert 0 < about["plate"]["hidden"] < 1
+    assert hides_scene(about) == (HIDDEN in page)
+    for hidden, named in ((0.0, False), (0.2, True)):
+        assert hides_scene({**about, "plate": {"hidden": hidden}}) == named
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 
 from egosim_jax.annotate.clip import Job, open_record
 from egosim_jax.annotate.frames import Sampling
-from egosim_jax.annotate.hand_tracks import drop_flashes, hold_hands, visible
+from egosim_jax.annotate.hand_tracks import before_entry, drop_flashes, hold_hands, visible, without
 from egosim_jax.annotate.objects import find_moved_objects, join_objects, measured
 from egosim_jax.annotate.prepare import Cutting, RefusedError
 from egosim_jax.annotate.scene import (
@@ -65,6 +65,20 @@ def test_a_silhouette_moves_through_a_gap_of_up_to_a_second_and_a_half(gap):
         np.testing.assert_allclose(halfway, np.full((21, 2), [3, 0]), atol=1e-9)
     else:
         assert np.isnan(halfway).all()
+
+
+@pytest.mark.parametrize(("shown", "absent"), [(200, True), (60, False)])
+def test_a_hand_that_enters_hides_nothing_of_the_first_frame(shown, absent):
+    """The place where it is found first shows something else before, or the hand, undetected."""
+    hands = StubHands(1.0, None)(np.zeros((9, 48, 80, 3), np.uint8))
+    late = np.zeros((9, 2), bool)
+    late[:3] = True
+    hands, frames = without(hands, late), np.full((9, 48, 80, 3), 60, np.uint8)
+    frames[3:] = shown
+    held = visible(without(hold_hands(hands, Fraction(16)), before_entry(hands, frames)))
+    assert held[0, RIGHT] != absent
+    assert held[1:, RIGHT].all()
+    assert not before_entry(StubHands(1.0, None)(frames), frames).any()
 
 
 def test_a_video_without_hands_holds_none():
