@@ -270,7 +270,7 @@ def _best_candidate(
             found.append(moved[choose_extent([r[0] for r in moved], growths, *scene)])
     if best := best_of(found, *scene):
         name = object_name(best[1].model.number, state.names)
-        unsure = f"seems to have moved {name}: its fingers do not show when they held it"
+        unsure = f"may have held {name}: its fingers do not show when"
         return best, "" if grip.sure else unsure
     if clusters and grip.sure:
         note = "closed on something without an id that the clip shows at rest"
@@ -291,14 +291,18 @@ def _best_motions(
     The change is relative to the object at rest, because an object in the table's color costs
     little anywhere. It is 0 if the object is not visible, and lower for an object in the grip.
     The first motion has the lowest. If the opening does not say when the hand held the object, the
-    best ones with other ends follow.
+    best ones with other ends follow. A hold begins with a fingertip within reach of the object.
     """
     accepted: list[Candidate] = []
     still = np.repeat(np.eye(4)[None], len(shown), axis=0)
     rest = _cost(model, still, cameras, shown, hidden, config)
     improvement = max(config.min_improvement, (1 - config.max_cost_ratio) * rest)
     faces = hull_on_plane(model.points_m, model.plane)
+    some = model.points_m[:: max(1, len(model.points_m) // config.compared_points)]
+    gaps_m = np.linalg.norm(grip.tips_m[:, :, None] - some, axis=-1).min(axis=(1, 2))
     for hold in grip.holds:
+        if gaps_m[hold[0]] > config.reach_m:
+            continue  # a hand that is far away takes nothing
         gripped = grip.has(model.points_m, hold[0])
         max_change = config.grip_evidence if gripped else -improvement
         carried = hold[0] == 0 and grip.carried == model.number
