@@ -13,11 +13,15 @@ from egosim_jax.annotate.config import Side
 from egosim_jax.annotate.prepare import RefusedError
 from egosim_jax.io.bounded import unlike
 from egosim_jax.perception.estimates import LEFT, RIGHT, HandTracks
+from egosim_jax.perception.silhouettes import PALM
 
 MAX_BOTH = 0.1
 """Maximum fraction of frames with two hands in a clip whose one hand has a given side."""
 FLASH_S = 0.3
 """Minimum time in seconds for which a second hand must be visible."""
+OVER_S, OVER_SIZE = 1.0, 0.5
+"""The same for a second hand whose palm is on the other's: their distance, as the median over its
+frames, is at most this share of the larger hand."""
 HOLD_S = 0.5
 """Time in seconds for which the silhouette of a lost hand is kept."""
 GAP_S = 1.5
@@ -56,14 +60,21 @@ def drop_flashes(hands: HandTracks, fps: Fraction) -> HandTracks:
     """Return tracks without second hands that appear only for a moment.
 
     If a hand is found for less than 0.3 s, not within 0.5 s before or after, and always together
-    with the other hand, it is a second detection of the other hand.
+    with the other hand, it is a second detection of the other hand. So is one that is found for
+    less than 1 s on the other hand.
     """
     found = visible(hands)
+    palms = hands.joints_px[:, :, PALM["human"]].mean(axis=2)
+    sizes = np.ptp(hands.joints_px, axis=2).max(axis=(1, 2))
+    apart = np.linalg.norm(palms[:, LEFT] - palms[:, RIGHT], axis=-1) / sizes
     dropped = np.zeros_like(found)
     for side in (LEFT, RIGHT):
         frames = np.flatnonzero(found[:, side])
         for run in np.split(frames, np.flatnonzero(np.diff(frames) > HOLD_S * fps) + 1):
-            if 0 < len(run) < FLASH_S * fps and found[run, 1 - side].all():
+            if not len(run) or not found[run, 1 - side].all():
+                continue
+            limit = OVER_S if np.median(apart[run]) <= OVER_SIZE else FLASH_S
+            if len(run) < limit * fps:
                 dropped[run, side] = True
     return without(hands, dropped)
 

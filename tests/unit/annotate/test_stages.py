@@ -187,6 +187,20 @@ def test_a_second_hand_for_a_moment_is_the_first_one_again():
     assert visible(drop_flashes(alone, Fraction(16))).sum() == 3
 
 
+@pytest.mark.parametrize(
+    ("count", "aside", "kept"), [(15, 0.2, False), (17, 0.2, True), (15, 0.8, True)]
+)
+def test_a_second_hand_on_the_first_one_is_dropped_unless_it_lasts(count, aside, kept):
+    """`aside` is the distance of the palms as a share of the hand's size."""
+    hands = StubHands(1.0, None)(np.zeros((60, 48, 80, 3), np.uint8))
+    size = np.ptp(hands.joints_px[0, RIGHT], axis=0).max()
+    hands.joints_px[20 : 20 + count, LEFT] = hands.joints_px[0, RIGHT] + [aside * size, 0]
+    hands.joints_hand_m[20 : 20 + count, LEFT] = hands.joints_hand_m[0, RIGHT]
+    found = visible(drop_flashes(hands, Fraction(16)))
+    assert found[:, LEFT].sum() == kept * count
+    assert found[:, RIGHT].all()
+
+
 def test_hands_outside_of_the_crop_are_missing_and_others_in_pixels_of_the_clip(tmp_path):
     recording = open_source(Source(name="cup", path=write(
         tmp_path / "cup.mp4", textured_video(9, 96, 160)
@@ -247,6 +261,7 @@ class TwoHands:
         hands = MirroredHands(0)(frames)
         for values in (hands.joints_px, hands.joints_hand_m, hands.presence):
             values[: self.both, LEFT] = values[: self.both, RIGHT]
+        hands.joints_px[: self.both, LEFT] += np.ptp(hands.joints_px[0, RIGHT], axis=0).max()
         hands.mirrored[: self.mirrored, LEFT] = True
         return hands
 
