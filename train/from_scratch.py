@@ -298,10 +298,16 @@ class FromClips(FromScratch):
                 grid=model.grid,
                 provenance={"metadata": str(metadata)},
             )
-            for problem in track(progress, f"packing {split}", total=len(items)):
-                if problem:
-                    print(printable(f"skipped: {problem}"), file=sys.stderr)
-                stop_if_preempted(out)
+            try:
+                for problem in track(progress, f"packing {split}", total=len(items)):
+                    if problem:
+                        print(printable(f"skipped: {problem}"), file=sys.stderr)
+                    stop_if_preempted(out)
+            except InputError as error:
+                raise InputError(
+                    f"{error} Training takes clips of {self.clip_frames} frames: shorter ones need "
+                    "another number, 4k + 1. (--clip-frames, --metadata)"
+                ) from error
         return frames
 
 
@@ -317,8 +323,8 @@ def select_split(items: Sequence[ClipFiles], split: Literal["train", "test"]) ->
         return select(items, where=f"split={split}")
     if len(items) < 2:
         raise InputError(
-            "The metadata has one clip: validation needs another one. Cut the video into "
-            "shorter clips, or add one. (--metadata)"
+            "The metadata has one clip: validation needs another one. Annotate more videos, or cut "
+            "them into shorter clips, and train on their length. (--metadata, --clip-frames)"
         )
     count = len(items)
     held_out = range(HELD_OUT - 1, count, HELD_OUT) or range(count - 1, count)

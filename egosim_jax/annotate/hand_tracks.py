@@ -20,18 +20,18 @@ MAX_BOTH = 0.1
 FLASH_S = 0.3
 """Minimum time in seconds for which a second hand must be visible."""
 OVER_S, OVER_SIZE = 1.0, 0.5
-"""The same for a second hand whose palm is on the other's: their distance, as the median over its
-frames, is at most this share of the larger hand."""
+"""The same for a second hand on the first one, and the maximum distance of their palms.
+
+The distance is the median over frames, as a share of the larger hand."""
 HOLD_S = 0.5
 """Time in seconds for which the silhouette of a lost hand is kept."""
 GAP_S = 1.5
 """Longest gap in seconds in which the silhouette moves from one detection to the next."""
-
-
 OTHER_LEVELS, OTHER_SHARE = 25, 0.8
-"""Minimum difference in 8-bit levels, and minimum share of the pixels of a hand that have it, if
-the image shows something else. A hand that moved for 0.1 s changes at most 0.74 of them, a hand
-that is not there yet 0.98 (30 frames per second, lift_tumbler)."""
+"""Minimum difference in 8-bit levels, in a minimum share of a hand's pixels, of another content.
+
+A hand that moved for 0.1 s changes at most 0.74 of them, a hand that is not there yet 0.98 (30
+frames per second, lift_tumbler)."""
 
 
 def visible(hands: HandTracks) -> Bool[np.ndarray, "f 2"]:

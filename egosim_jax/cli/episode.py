@@ -11,6 +11,7 @@ import tyro
 
 from egosim_jax.rendering import RendererName
 from egosim_jax.runtime.command import ExitCode, Writes
+from egosim_jax.runtime.terminal import counted
 from egosim_jax.types import InputError, check_counts, check_seed, object_name
 
 if TYPE_CHECKING:
@@ -189,7 +190,7 @@ class FromAnnotation:
     """Folder of the annotated clip."""
     out: Path
     """Folder to write, or a file whose name ends in .zip."""
-    config: str = "real_tiny"
+    config: str = "tabletop"
     """Model whose length, size and frame rate the clips have."""
     clips: int | None = None
     """Number of clips; by default as many as fit into the video."""
@@ -340,7 +341,11 @@ def _read_state(path: Path) -> SceneState:
 
 
 def _save(episode: episodes.Episode, out: Path, *, describe: bool = False) -> int:
-    """Check and write the episode; print its summary and, with `describe`, its objects."""
+    """Check and write the episode; print its summary and, with `describe`, its objects.
+
+    Raises `InputError` if there is another episode: it may have been edited.
+    """
+    _keep_others(episode, out)
     episode.save(out)
     print(f"{out}: {summary(episode)}")
     if describe:
@@ -348,6 +353,25 @@ def _save(episode: episodes.Episode, out: Path, *, describe: bool = False) -> in
 
         print(describe_objects(episode.state))
     return ExitCode.DONE
+
+
+def _keep_others(episode: episodes.Episode, out: Path) -> None:
+    """Raise `InputError` if there is an episode that is not equal to this one."""
+    from egosim_jax.io.digest import fingerprint
+
+    if not out.exists():
+        return
+    try:
+        there = type(episode).load(out)
+    except InputError:
+        return  # damaged, or no episode: `save` decides
+    if fingerprint(there) != fingerprint(episode):
+        before, now = (counted(len(found.actions), "clip") for found in (there, episode))
+        clips = f" of {before}, not {now}" if before != now else ", maybe an edited one"
+        raise InputError(
+            f"{out} has another episode{clips}. It is not replaced: choose another path, or remove "
+            "it. (--out)"
+        )
 
 
 def summary(episode: episodes.Episode) -> str:
@@ -363,9 +387,9 @@ def summary(episode: episodes.Episode) -> str:
     ]
     where = f" (none in {', '.join(handless)})" if handless else ""
     return (
-        f"{len(episode.actions)} clips of {frames} frames of {width}x{height} at {episode.fps} "
-        f"fps, {episode.actions[0].kind} hands{where}, {len(episode.state.points_m)} points, "
-        f"{known} ground truth"
+        f"{counted(len(episode.actions), 'clip')} of {frames} frames of {width}x{height} at "
+        f"{episode.fps} fps, {episode.actions[0].kind} hands{where}, "
+        f"{len(episode.state.points_m)} points, {known} ground truth"
     )
 
 

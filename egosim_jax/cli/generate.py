@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import tyro
 
 from egosim_jax.data.clip_files import Prompts
+from egosim_jax.runtime import interrupts
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.runtime.phases import phase
 from egosim_jax.types import InputError, MeshConfig, check_counts, check_seed
@@ -113,6 +114,7 @@ class Generate:
 
     def run(self) -> int:
         """Check all options, compile and generate."""
+        interrupts.resume_by("--skip-existing")
         with phase(f"loads JAX and {self.config}"):
             from egosim_jax.generation.batch import BatchJob
             from egosim_jax.io.executables import share_with_jax

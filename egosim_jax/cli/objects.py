@@ -15,8 +15,9 @@ if TYPE_CHECKING:
 
 NO_OBJECTS = (
     "no point has an object id, so only what a hand closes on can move, if the perception is "
-    "classical. Make the episode with --objects auto or with a mask, annotate the video at its own "
-    "size (without --config and --clips), or give object_ids to state_from_depth."
+    "classical. A video has objects if it is annotated at its own size (without --config and "
+    "--clips), images if the episode is made with --objects auto or with a mask; in Python, give "
+    "object_ids to state_from_depth."
 )
 """Warning of a scene without objects, after its name."""
 

@@ -226,10 +226,16 @@ def check_fits(episode: Episode, video: VideoSpec, config: str) -> None:
     frames, height, width = episode.shape
     own = f"{frames} frames of {width}x{height} at {episode.fps} fps"
     model = f"{video.frames} of {video.width}x{video.height} at {video.fps} fps"
-    if (*episode.shape, episode.fps) != (video.frames, video.height, video.width, video.fps):
+    shape = (*episode.shape, episode.fps)
+    if shape != (video.frames, video.height, video.width, video.fps):
+        from egosim_jax import configs
+
+        videos = {name: configs.get(name).video for name in configs.names()}
+        fitting = [n for n, v in videos.items() if shape == (v.frames, v.height, v.width, v.fps)]
+        others = f"Models of such clips: {', '.join(fitting)}. " if fitting else ""
         raise InputError(
             f"The episode has clips of {own}, and {config} generates {model}: they must be equal. "
-            "Choose another model (--config), or make the episode for this one."
+            f"{others}Choose another model (--config), or make the episode for this one."
         )
 
 

@@ -50,6 +50,8 @@ MAX_RATE_RATIO = 1.01
 DAMAGE: dict[Policy, Damage] = {"strict": "refuse", "lenient": "stop"}
 LENIENT = "egosim generate --lenient"
 """The one command with the lenient policy, and its option."""
+MAX_STRETCH = 1.5
+"""Maximum ratio of the factors of the two sides of a video that is resized."""
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi")
 
 
@@ -156,6 +158,7 @@ def check_clip(
         taken = _taken(probed, spec, resampling)
         problems += _length_problems(probed, taken, start + (spec.frames if spec else 1), grid)
         problems += _size_problems(sizes, grid.spatial_stride * grid.patch)
+        problems += _shape_problems(sizes, spec) if spec else []
     return [f"{files.row} ({files.video_id}): {problem}" for problem in problems]
 
 
@@ -305,6 +308,19 @@ def _size_problems(sizes: dict[str, tuple[int, int]], unit: int) -> list[str]:
         for height, width in set(sizes.values())
         if height % unit or width % unit
     ]
+
+
+def _shape_problems(sizes: dict[str, tuple[int, int]], spec: VideoSpec) -> list[str]:
+    problems = []
+    for height, width in set(sizes.values()):
+        stretch = (spec.width * height) / (spec.height * width)
+        if max(stretch, 1 / stretch) > MAX_STRETCH:
+            problems.append(
+                f"{width}x{height} pixels would be stretched to {spec.width}x{spec.height}: one "
+                f"side by {max(stretch, 1 / stretch):.2g} times as much as the other, more than "
+                f"{MAX_STRETCH:g}. Crop the videos, or choose another model. ({LENIENT} stretches)"
+            )
+    return problems
 
 
 def _table(values: dict[str, int] | dict[str, str]) -> str:

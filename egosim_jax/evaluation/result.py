@@ -63,6 +63,8 @@ class Evaluation:
     """Measures that were not computed, with the reasons."""
     skipped: Sequence[str] = ()
     """Clips that were not compared, with the reasons."""
+    absent: Sequence[str] = ()
+    """Clips of the metadata that were not generated, in a line for each folder."""
     crops: Sequence[str] = ()
     """Crops of the recorded images that the folders show, in words."""
 
@@ -82,6 +84,7 @@ class Evaluation:
             definitions=definitions,
             protocol=scoring.protocol,
             skipped=scoring.skipped,
+            absent=scoring.absent,
             crops=scoring.crops,
             **options,
         )
@@ -267,6 +270,7 @@ class Evaluation:
         ]
         if "lpips_alex" in self.shown and "lpips_alex" not in self.definitions:
             lines.append(f"lpips_alex: {protocol['lpips_alex']}")
+        lines += [f"absent: {line}" for line in self.absent]
         lines += [f"crop: {line}" for line in self.crops]
         lines += [f"unavailable: {line}" for line in self.unavailable]
         return lines + ([f"published: {self.source}"] if self.published else [])

@@ -25,9 +25,11 @@ from egosim_jax.evaluation.fvd import is_feature
 from egosim_jax.evaluation.measures import VERSION, GroundTruth, Measure, Scorer
 from egosim_jax.evaluation.methods import FIT, Folder, Method, Shape, read_at
 from egosim_jax.evaluation.registration import WHOLE, Edges
+from egosim_jax.io.bounded import listing
 from egosim_jax.io.digest import fingerprint, sha256
 from egosim_jax.io.video import VideoInfo, probe_video
 from egosim_jax.runtime.progress import track
+from egosim_jax.runtime.terminal import counted
 from egosim_jax.types import InputError
 
 MAX_RATE_ERROR = 0.01
@@ -102,6 +104,8 @@ class Scoring:
     """Groups of columns."""
     protocol: Protocol
     cache: ScoreCache
+    absent: list[str] = field(default_factory=list)
+    """Clips of the metadata that were not generated, in a line for each folder."""
     skipped: list[str] = field(default_factory=list)
     """Clips that were not compared, with reasons."""
     crops: list[str] = field(default_factory=list)
@@ -157,6 +161,12 @@ class Scoring:
                     )
                 done = {"start": 0, "status": "done"}
                 results = {name: {"source_id": name, **done} for name in rows}
+            known = {line["source_id"] for line in results.values()}
+            if absent := [name for name in rows if name not in known]:
+                count = f"{len(absent)} of {counted(len(rows), 'clip')}"
+                self.absent.append(
+                    f"{count} of the metadata not in {folder.path}: {listing(absent)}"
+                )
             for output_id, line in results.items():
                 files, start = rows.get(line["source_id"]), line["start"]
                 if files is None:

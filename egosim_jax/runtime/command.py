@@ -282,6 +282,7 @@ def _mistyped(
 
 def run_with_exit_codes(run: Callable[[], int]) -> int:
     """Run a command, printing exceptions as messages and returning their exit codes."""
+    interrupts.begin()
     try:
         return run()
     except InputError as error:

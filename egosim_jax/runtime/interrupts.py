@@ -19,6 +19,7 @@ CODE = 128 + signal.SIGINT
 PREPARED = ("config.json", "environment.json", "journal.jsonl")
 """Files of a run folder that are written before any result."""
 _folders: set[Path] = set()
+_options: list[str] = []
 
 
 def expect() -> None:
@@ -33,9 +34,20 @@ def ignore() -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
+def begin() -> None:
+    """Forget what an earlier command of this process would continue."""
+    _folders.clear()
+    _options.clear()
+
+
 def resume_from(folder: Path) -> None:
     """Remember that the command resumes from the results in a folder, if it has any."""
     _folders.add(folder.absolute())
+
+
+def resume_by(option: str) -> None:
+    """Remember an option without which the same command would begin again."""
+    _options.append(option)
 
 
 def print_interrupted() -> None:
@@ -44,6 +56,7 @@ def print_interrupted() -> None:
         print("interrupted", file=sys.stderr, flush=True)
         return
     program, *options = sys.argv
+    options += [option for option in dict.fromkeys(_options) if option not in options]
     # `egosim train` is a program of two words (`cli/__main__.py`); others are paths.
     words = [program] if os.sep in program else program.split()
     command = shlex.join([*words, *options])

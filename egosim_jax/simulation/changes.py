@@ -31,9 +31,9 @@ class MovedObject:
 
     def __str__(self) -> str:
         """Return the motion in one line."""
-        held = ", and is held" if self.held else ""
+        held = "and is held" if self.held else "and is released"
         turned = f"turned by {self.turned_deg:.0f} degrees"
-        return f"{self.name}: moved by {self.moved_mm:.0f} mm, {turned}{held}"
+        return f"{self.name}: moved by {self.moved_mm:.0f} mm, {turned}, {held}"
 
 
 def moved_objects(before: SceneState, after: SceneState) -> list[MovedObject]:

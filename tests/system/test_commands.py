@@ -159,6 +159,17 @@ def test_evaluate_reports_the_generated_clips_along_with_the_baselines(generated
     assert "PSNR" in capsys.readouterr().out
 
 
+def test_clips_that_were_not_generated_are_named(generated, clips, tmp_path, capsys):
+    out = tmp_path / "run"
+    shutil.copytree(generated, out)
+    lines = (out / "results.jsonl").read_text("utf-8").splitlines(keepends=True)
+    done = [line for line in lines if json.loads(line)["status"] == "done"]
+    (out / "results.jsonl").write_text("".join(done))
+    assert main(["evaluate", "--generated", str(out), "--metadata", str(clips)]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"absent: 1 of 2 clips of the metadata not in {out}: sample_" in said
+
+
 def test_a_simulation_is_not_evaluated_but_has_its_scores(clips, tmp_path, capsys):
     (tmp_path / "state_0.ply").touch()
     assert main(["evaluate", "--generated", str(tmp_path), "--metadata", str(clips)]) == 2

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -139,6 +140,8 @@ def test_files_of_cameras_and_hands_become_an_episode(tmp_path, episode):
     assert made.first_frame is not None
     assert made.first_frame.shape == (64, 96, 3)
     assert len(made.state.points_m) == np.isfinite(episode.ground_truth[0].depth_m[0]).sum() * 4
+    assert make(tmp_path, "--state", str(tmp_path / "state")) == 2
+    shutil.rmtree(tmp_path / "out")
     assert make(tmp_path, "--state", str(tmp_path / "state")) == 0
     assert len(Episode.load(tmp_path / "out").state.points_m) == len(episode.state.points_m)
 

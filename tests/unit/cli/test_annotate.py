@@ -36,9 +36,17 @@ def test_a_video_is_annotated_packed_and_made_an_episode(video, tmp_path, capsys
     assert main(packed) == ExitCode.DONE
     assert main(["data", "check", "--shards", shards]) == ExitCode.DONE
     made = ["episode", "from-annotation", str(out / "cup"), "--out", str(tmp_path / "episode")]
+    made += ["--config", "real_tiny"]
     assert main(made) == ExitCode.DONE
     episode = Episode.load(tmp_path / "episode")
     assert (episode.shape, len(episode.actions)) == ((17, 96, 160), 2)
+    # The same command gives the same episode; another one is not replaced.
+    assert main(made) == ExitCode.DONE
+    before = (tmp_path / "episode" / "episode.json").read_bytes()
+    capsys.readouterr()
+    assert main([*made, "--clips", "1"]) == ExitCode.USAGE
+    assert "another episode of 2 clips, not 1 clip" in capsys.readouterr().err
+    assert (tmp_path / "episode" / "episode.json").read_bytes() == before
 
 
 def test_a_video_without_clips_is_named_with_its_reason(video, tmp_path, capsys):

@@ -49,17 +49,27 @@ def test_id_prompt_and_further_columns_come_from_the_metadata(files):
 
 
 def test_colors_are_stretched_with_lanczos(files):
-    triplet = load_triplet(files, dataclasses.replace(NATIVE, height=16, width=64))
+    triplet = load_triplet(files, dataclasses.replace(NATIVE, height=16, width=32))
     frame = Image.fromarray(read_video(files.prior).frames[3])
-    expected = frame.resize((64, 16), Image.Resampling.LANCZOS)
+    expected = frame.resize((32, 16), Image.Resampling.LANCZOS)
     np.testing.assert_array_equal(triplet.prior[3], np.asarray(expected))
 
 
 def test_the_mask_is_channel_0_of_the_bilinear_frames(files):
-    triplet = load_triplet(files, dataclasses.replace(NATIVE, height=16, width=64))
+    triplet = load_triplet(files, dataclasses.replace(NATIVE, height=16, width=32))
     frame = Image.fromarray(read_video(files.mask).frames[3])
-    expected = np.asarray(frame.resize((64, 16), Image.Resampling.BILINEAR))[..., 0]
+    expected = np.asarray(frame.resize((32, 16), Image.Resampling.BILINEAR))[..., 0]
     np.testing.assert_array_equal(triplet.mask[3], expected)
+
+
+def test_a_portrait_is_not_stretched_to_a_landscape_unless_it_is_wanted(files):
+    tall = dataclasses.replace(NATIVE, height=64, width=32)
+    (problem, *_) = check_clip(files, tall)
+    assert "48x32 pixels would be stretched to 32x64: one side by 3 times" in problem
+    with pytest.raises(InputError, match="stretched"):
+        load_triplet(files, tall)
+    assert check_clip(files, tall, policy="lenient") == []
+    assert load_triplet(files, tall, policy="lenient").prior.shape[1:3] == (64, 32)
 
 
 def test_a_longer_clip_gives_the_window_at_start(files):

@@ -181,6 +181,11 @@ def test_the_line_that_continues_can_be_run(monkeypatch, capsys, tmp_path, argv,
     monkeypatch.setattr(sys, "argv", argv)
     interrupts.print_interrupted()
     assert capsys.readouterr().err == f"interrupted; to continue: {said}\n"
+    monkeypatch.setattr(interrupts, "_options", [])
+    for _ in range(2):
+        interrupts.resume_by("--skip-existing")
+    interrupts.print_interrupted()
+    assert capsys.readouterr().err == f"interrupted; to continue: {said} --skip-existing\n"
 
 
 @pytest.mark.parametrize(

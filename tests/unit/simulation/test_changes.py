@@ -68,5 +68,5 @@ def test_the_motion_is_of_the_center_and_since_the_state_before(before):
 def test_objects_have_their_names_and_the_order_of_their_ids():
     end = moved(moved(scene(), 2, turn(0, CENTER, (0, 0, 0.01))), 1, turn(0, CENTER, (0.02, 0, 0)))
     first, second = moved_objects(scene(), end)
-    assert str(first) == "green cone: moved by 20 mm, turned by 0 degrees"
+    assert str(first) == "green cone: moved by 20 mm, turned by 0 degrees, and is released"
     assert (second.object_id, second.name, second.held) == (2, "object 2", False)

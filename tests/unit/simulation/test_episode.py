@@ -201,6 +201,13 @@ def test_a_folder_that_is_no_episode_is_named(tmp_path, file, message):
         Episode.load(tmp_path / "taken")
 
 
+def test_a_video_is_annotated_first(tmp_path):
+    path = tmp_path / "lift.MP4"
+    path.write_bytes(b"video")
+    with pytest.raises(InputError, match="is a video: annotate it"):
+        Episode.load(path)
+
+
 def archive(entries, compression=zipfile.ZIP_STORED):
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", compression) as file:
