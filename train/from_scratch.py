@@ -124,14 +124,15 @@ class FromScratch(Recipe):
         check_counts({"--stride": self.stride})
         from egosim_jax.configs.model import Networks
         from egosim_jax.io.run import open_folder
-        from egosim_jax.train.loop import train
+        from egosim_jax.train.loop import phase0, train
         from egosim_jax.train.monitor import Samples
 
         require_single_process(self.config)
         free = ("products", "preflight", "json", "search", "bundle")
         open_folder(out, self, mutable=[*resume_mutable("vae", "denoiser"), *free])
         frames = self.frames(out)
-        networks = Networks.random(configs.get(self.config), seed=0)
+        with phase0("makes the networks"):
+            networks = Networks.random(configs.get(self.config), seed=0)
         networks.vae = self._autoencoder(frames, out)
         latents = {split: self._encode(split, frames[split], out) for split in frames}
         data, validation = _join_latents(latents, out / "latents" / "joined"), latents["test"]

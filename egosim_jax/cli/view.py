@@ -23,6 +23,9 @@ from egosim_jax.types import InputError
 if TYPE_CHECKING:
     from egosim_jax.types import SceneState
 
+IMAGES = (".png", ".jpg", ".jpeg", ".webp")
+"""Suffixes of the images that the command draws."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class View:
@@ -54,17 +57,22 @@ class View:
             print(page)
             return ExitCode.DONE
         if (self.path / JOURNAL).exists():
+            first = self.path / "state_0.ply"
+            state = f"; or look at one state: egosim view {first}" if first.exists() else ""
             install = "" if find_spec("rerun") else "pip install 'egosim-jax[viewer]' and "
             raise InputError(
                 f"{self.path} has no {RECORDING}, which egosim simulate writes where Rerun is "
-                f"installed: {install}run the same command again, which adds it; or look at one "
-                f"state: {self.path / 'state_0.ply'}."
+                f"installed: {install}run the same command again, which adds it{state}."
             )
         if self.path.is_dir() and stages_of(self.path):
             print(write_page(self.path, self.out))
             return ExitCode.DONE
         state = self._state()
         out = self.out or Path(f"{self.path.stem}.png")
+        if out.suffix.lower() not in IMAGES:
+            raise InputError(
+                f"{out} is no image: its name must end in {', '.join(IMAGES)}. (--out)"
+            )
         write_portrait(out, state, up=self.up or up_of(state))
         low, high = state.points_m.min(axis=0), state.points_m.max(axis=0)
         size = " x ".join(f"{length:.2f}" for length in high - low)

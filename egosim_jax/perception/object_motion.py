@@ -250,7 +250,8 @@ def _best_candidate(
         prior = config.prompt_prior if name and name in action.prompt.lower() else 1.0
         found.append(_best_motions(model, grip, prior, action.cameras, shown, hidden, config))
     if held:
-        return best_of(found, *scene), ""
+        best = best_of(found, *scene)
+        return best, _doubt(best, grip, state)
     clusters, note = clusters_without_id(grip, action.cameras, state, config.growth)
     for growths in clusters:
         tried = [
@@ -269,12 +270,20 @@ def _best_candidate(
                 moved += [ranked] if ranked else []
             found.append(moved[choose_extent([r[0] for r in moved], growths, *scene)])
     if best := best_of(found, *scene):
-        name = object_name(best[1].model.number, state.names)
-        unsure = f"may have held {name}: its fingers do not show when"
-        return best, "" if grip.sure else unsure
+        return best, _doubt(best, grip, state)
     if clusters and grip.sure:
         note = "closed on something without an id that the clip shows at rest"
     return None, note
+
+
+def _doubt(best: Candidate | None, grip: Grip, state: SceneState) -> str:
+    """Return a note on what speaks against a motion; empty if nothing does."""
+    if best is None:
+        return ""
+    name = object_name(best[1].model.number, state.names)
+    if best[1].by_grip:
+        return f"carried {name}, as its grip shows, but the clip shows it at rest"
+    return "" if grip.sure else f"may have held {name}: its fingers do not show when"
 
 
 def _best_motions(
@@ -316,7 +325,7 @@ def _best_motions(
             if path is None:
                 continue
             cost = prior * _cost(model, path, cameras, shown, hidden, config)
-            known = np.isfinite(cost) and np.isfinite(rest)
+            known = bool(np.isfinite(cost) and np.isfinite(rest))
             change = (cost - rest if known else 0.0) - max_change
             if change < 0:
                 motion = ObjectMotion(
@@ -325,6 +334,7 @@ def _best_motions(
                     released=hold[1],
                     path=path,
                     hinged=path is hinge,
+                    by_grip=known and cost > rest + config.min_improvement,
                 )
                 accepted.append((change, motion))
     accepted.sort(key=lambda candidate: candidate[0])

@@ -114,6 +114,8 @@ class ObjectMotion:
     """World motion in each frame, relative to the pose before the clip."""
     hinged: bool = False
     """True for a part that turns about an axis and stays on it, such as a lid."""
+    by_grip: bool = False
+    """True if the grip alone decided, against a clip that shows the object at rest."""
 
     @property
     def holds_to_end(self) -> bool:

@@ -10,14 +10,20 @@ import os
 import shlex
 import signal
 import sys
+import threading
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 CODE = 128 + signal.SIGINT
 """Exit code after Ctrl-C, as of a program that the signal ends."""
 PREPARED = ("config.json", "environment.json", "journal.jsonl")
 """Files of a run folder that are written before any result."""
+AGAIN_S = 0.1
+"""Seconds after which an interrupt that Python ignored comes again."""
 _folders: set[Path] = set()
 _options: list[str] = []
 
@@ -26,6 +32,7 @@ def expect() -> None:
     """Install the handler of Ctrl-C."""
     with suppress(ValueError):  # not in the main thread
         signal.signal(signal.SIGINT, _interrupt)
+        sys.unraisablehook = partial(_repeat, sys.unraisablehook)
 
 
 def ignore() -> None:
@@ -61,6 +68,16 @@ def print_interrupted() -> None:
     words = [program] if os.sep in program else program.split()
     command = shlex.join([*words, *options])
     print(f"interrupted; to continue: {command}", file=sys.stderr, flush=True)
+
+
+def _repeat(otherwise: Callable[[Any], None], ignored: Any) -> None:
+    """Send the signal again if Python ignored its exception, as in callbacks of the collector."""
+    if ignored.exc_type is not KeyboardInterrupt:
+        otherwise(ignored)
+        return
+    again = threading.Timer(AGAIN_S, os.kill, (os.getpid(), signal.SIGINT))
+    again.daemon = True
+    again.start()
 
 
 def _has_results(folder: Path) -> bool:

@@ -92,30 +92,43 @@ def load_backend(
     )
 
 
-def make(*, backend: Backend | None = None, world: World = "generated", **options: Any) -> WorldEnv:
-    """Return a `WorldEnv` of a backend, or of a world by name."""
+def make(*, backend: Backend | None = None, world: World | None = None, **options: Any) -> WorldEnv:
+    """Return a `WorldEnv` of a backend, or of a world by name, by default the generated one."""
     from egosim_jax.interactive.env.single import WorldEnv
 
-    _check_options(WorldEnv, options)
-    return WorldEnv(backend or load_backend(world), **options)
+    _check_options(WorldEnv, backend, world, options)
+    return WorldEnv(backend or load_backend(world or "generated"), **options)
 
 
 def make_vec(
     *,
     num_envs: int,
     backend: Backend | None = None,
-    world: World = "generated",
+    world: World | None = None,
     **options: Any,
 ) -> WorldVectorEnv:
-    """Return a `WorldVectorEnv` of a backend, or of a world by name."""
+    """Return a `WorldVectorEnv` of a backend, or of a world by name (`make`)."""
     from egosim_jax.interactive.env.vector import WorldVectorEnv
 
-    _check_options(WorldVectorEnv, options)
-    return WorldVectorEnv(backend or load_backend(world, batch=num_envs), num_envs, **options)
+    _check_options(WorldVectorEnv, backend, world, options)
+    chosen = backend or load_backend(world or "generated", batch=num_envs)
+    return WorldVectorEnv(chosen, num_envs, **options)
 
 
-def _check_options(env: type, options: Mapping[str, Any]) -> None:
-    """Raise `InputError` for an option that an environment lacks: a world takes long to load."""
+def _check_options(env: type, backend: Any, world: Any, options: Mapping[str, Any]) -> None:
+    """Raise `InputError` for options that cannot be: a world takes long to load."""
+    from egosim_jax.interactive.env.single import check_settings
+
+    if backend is not None and world is not None:
+        raise InputError(f"Give a backend or a world, not both: world is {world!r:.40}.")
+    if world is not None and not isinstance(world, str):
+        raise InputError(
+            f"The world is {type(world).__name__}: it must be 'generated' or 'true'. Pass what "
+            "load_backend returns as backend=."
+        )
+    if isinstance(backend, str):
+        raise InputError(f"The backend is {backend!r:.40}: name a world by world=.")
+    check_settings(**{name: options[name] for name in ("actions", "max_chunks") if name in options})
     known = ["backend", "world", *(n for n in signature(env).parameters if n not in _POSITIONAL)]
     if unknown := [name for name in options if name not in known]:
         raise InputError(

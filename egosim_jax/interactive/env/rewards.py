@@ -88,6 +88,17 @@ def check_callable(reward: Any) -> None:
         )
 
 
+def judge(reward: RewardFn, outcome: Outcome) -> Reward:
+    """Return the reward of an outcome. Raises `InputError` if the function returns none."""
+    result: Any = reward(outcome)
+    if not isinstance(result, Reward):
+        raise InputError(
+            f"The reward function returned {quote(result)}: it must return a Reward, for instance "
+            "Reward(reward=0.5). (reward)"
+        )
+    return result
+
+
 def no_reward(outcome: Outcome) -> Reward:
     """Return a reward of 0, for callers that compute their own from the frames."""
     return Reward(reward=0.0)

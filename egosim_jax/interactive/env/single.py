@@ -34,6 +34,7 @@ from egosim_jax.interactive.env.rewards import (
     RewardFn,
     check_callable,
     check_reward,
+    judge,
     no_reward,
 )
 from egosim_jax.interactive.env.validity import validity
@@ -54,8 +55,25 @@ OPTIONS = ("start", "episode", "state", "prompt")
 CLOSED = "The environment is closed: make a new one."
 
 
+def check_settings(*, actions: Any = None, max_chunks: Any = 1) -> None:
+    """Raise `InputError` for settings that an environment cannot have."""
+    if actions is not None and not isinstance(actions, ActionSpec):
+        raise InputError(
+            f"actions is {actions!r:.40}: it must be an ActionSpec, such as "
+            "ActionSpec(layout='wrist'). (actions)"
+        )
+    if type(max_chunks) is not int or max_chunks < 1:
+        raise InputError(
+            f"max_chunks is {max_chunks!r:.40}: it must be a whole number of at least 1."
+        )
+
+
 def observation_space(video: VideoSpec, spec: ActionSpec, observe: tuple[str, ...]) -> spaces.Dict:
     """Return the space of the row and the requested observations."""
+    if isinstance(observe, str):
+        raise InputError(
+            f"observe is the text {observe!r:.40}: give a tuple of names, such as ('frames',)."
+        )
     if unknown := [name for name in observe if name not in OBSERVATIONS]:
         raise InputError(
             f"There is no observation {unknown[0]!r:.40}: choose from {', '.join(OBSERVATIONS)}."
@@ -257,6 +275,12 @@ class WorldEnv(gymnasium.Env):
         max_chunks: int = 10,
         render_mode: str | None = None,
     ):
+        check_settings(actions=actions, max_chunks=max_chunks)
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise InputError(
+                f"render_mode is {render_mode!r:.40}: it must be 'rgb_array' or None. The page of "
+                "`egosim play` shows an episode in a browser."
+            )
         self.backend, self.actions = backend, actions or ActionSpec()
         self.metadata = {**self.metadata, "render_fps": backend.video.fps}
         self.render_mode = render_mode
@@ -368,7 +392,7 @@ class WorldEnv(gymnasium.Env):
     ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Move the episode past a step, and return its result."""
         running = self.running
-        result = self._reward(Outcome(first=running.start.state, step=step))
+        result = judge(self._reward, Outcome(first=running.start.state, step=step))
         info = {**running.advance(chunk, step), **known, "success": result.success}
         truncated = running.chunks >= self._max_chunks and not result.terminated
         self._ended = result.terminated or truncated

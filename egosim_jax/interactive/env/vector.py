@@ -20,11 +20,13 @@ from egosim_jax.interactive.env.rewards import (
     RewardFn,
     check_callable,
     check_reward,
+    judge,
     no_reward,
 )
 from egosim_jax.interactive.env.single import (
     CLOSED,
     RunningEpisode,
+    check_settings,
     observation_space,
     seed_of,
     start_from_options,
@@ -69,6 +71,7 @@ class WorldVectorEnv(VectorEnv):
         max_chunks: int = 10,
     ):
         check_counts({"num_envs": num_envs})
+        check_settings(actions=actions, max_chunks=max_chunks)
         self.num_envs, self.backend, self.actions = num_envs, backend, actions or ActionSpec()
         self._observe, self._max_chunks = tuple(observe), max_chunks
         self._rewards = [reward] * num_envs if callable(reward) else list(reward)
@@ -188,7 +191,7 @@ class WorldVectorEnv(VectorEnv):
             wait(made)  # all: a step that still runs must not outlive an error of another
         steps, known = zip(*(future.result() for future in made), strict=True)
         results = [
-            reward(Outcome(first=running.start.state, step=step))
+            judge(reward, Outcome(first=running.start.state, step=step))
             for running, reward, step in zip(self.running, self._rewards, steps, strict=True)
         ]
         infos = [
