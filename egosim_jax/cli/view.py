@@ -67,12 +67,12 @@ class View:
         if self.path.is_dir() and stages_of(self.path):
             print(write_page(self.path, self.out))
             return ExitCode.DONE
-        state = self._state()
         out = self.out or Path(f"{self.path.stem}.png")
         if out.suffix.lower() not in IMAGES:
             raise InputError(
                 f"{out} is no image: its name must end in {', '.join(IMAGES)}. (--out)"
             )
+        state = self._state()
         write_portrait(out, state, up=self.up or up_of(state))
         low, high = state.points_m.min(axis=0), state.points_m.max(axis=0)
         size = " x ".join(f"{length:.2f}" for length in high - low)

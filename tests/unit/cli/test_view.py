@@ -43,3 +43,19 @@ def test_with_rerun_the_extra_is_not_named(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="run the same command again") as refused:
         View(path=tmp_path).run()
     assert "pip install" not in str(refused.value)
+
+
+def test_a_simulation_without_states_has_none_to_look_at(tmp_path, monkeypatch):
+    monkeypatch.setattr("egosim_jax.cli.view.find_spec", lambda name: name)
+    (tmp_path / "journal.jsonl").touch()
+    for named in (False, True):
+        with pytest.raises(InputError) as refused:
+            View(path=tmp_path).run()
+        assert ("state_0.ply" in str(refused.value)) == named
+        (tmp_path / "state_0.ply").touch()
+
+
+@pytest.mark.parametrize("name", ["x.txt", "x.ply", "x"])
+def test_a_drawing_is_an_image(tmp_path, name):
+    with pytest.raises(InputError, match=r"is no image: its name must end in \.png"):
+        View(path=tmp_path / "cloud.ply", out=tmp_path / name).run()

@@ -150,6 +150,8 @@ def test_a_clip_that_leaves_an_object_at_rest_does_not_overrule_a_firm_grip(clip
     last, true = found.world_from_object[target][-1], clip.world_from_body[clip.target]
     gap = (last - true[-1] @ invert(true[0])) @ true[0][:, 3]
     assert np.linalg.norm(gap) < 0.02
+    (note,) = found.notes
+    assert f"carried {clip.target}, as its grip shows, but the clip shows it at rest" in note
 
 
 def test_a_motion_is_uncertain_if_the_fingers_do_not_show_a_hold(clip, found):

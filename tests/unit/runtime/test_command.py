@@ -188,6 +188,31 @@ def test_the_line_that_continues_can_be_run(monkeypatch, capsys, tmp_path, argv,
     assert capsys.readouterr().err == f"interrupted; to continue: {said} --skip-existing\n"
 
 
+def test_an_interrupt_that_python_ignores_comes_again():
+    """An exception in a callback of the garbage collector is ignored, and the signal with it."""
+    code = """
+import gc, os, signal, time
+from egosim_jax.runtime import interrupts
+interrupts.expect()
+sent = []
+def collect(phase, info):
+    if not sent:
+        sent.append(phase)
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.01)
+gc.callbacks.append(collect)
+try:
+    gc.collect()
+    time.sleep(30)
+    print("lost")
+except KeyboardInterrupt:
+    print("interrupted", sent)
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ended.stdout == "interrupted ['start']\n"
+    assert "ignored" not in ended.stderr
+
+
 @pytest.mark.parametrize(
     ("made", "said"),
     [

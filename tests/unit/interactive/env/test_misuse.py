@@ -4,6 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+from egosim_jax.interactive import env as environments
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.rewards import GoalImage, MoveObject
 from egosim_jax.interactive.env.single import WorldEnv, seed_of, to_options
@@ -162,3 +163,36 @@ def test_an_unknown_option_is_refused_before_a_world_is_loaded(vector, capsys):
     with pytest.raises(InputError, match=f"no option 'wrld' of an environment. {known}"):
         make("egosim_jax/Tabletop-v0", wrld="true", **count)
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"max_chunks": 0}, "max_chunks is 0: it must be a whole number of at least 1"),
+        ({"max_chunks": -1}, "max_chunks is -1"),
+        ({"max_chunks": "a"}, "max_chunks is 'a'"),
+        ({"max_chunks": True}, "max_chunks is True"),
+        ({"actions": "wrist"}, r"actions is 'wrist': .*ActionSpec\(layout='wrist'\)"),
+        ({"world": "true", "backend": painted()}, "Give a backend or a world"),
+        ({"backend": "true"}, "name a world by world="),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("count", [0, 2], ids=["single", "vector"])
+def test_settings_are_refused_before_a_world_loads(monkeypatch, count, options, message):
+    monkeypatch.setattr(environments, "load_backend", lambda *_, **__: pytest.fail("it loaded"))
+    with pytest.raises(InputError, match=message):
+        environments.make_vec(num_envs=2, **options) if count else environments.make(**options)
+
+
+def test_a_render_mode_that_is_not_known_is_refused():
+    with pytest.raises(InputError, match="render_mode is 'human': it must be 'rgb_array' or None"):
+        make(0, render_mode="human")
+
+
+@pytest.mark.parametrize("count", [0, 2], ids=["single", "vector"])
+def test_a_reward_that_is_no_reward_is_named(count):
+    env = make(count, reward=lambda outcome: 0.5)
+    env.reset(seed=3)
+    with pytest.raises(InputError, match=r"The reward function returned 0\.5"):
+        env.chunk_step(rows(env, count))
