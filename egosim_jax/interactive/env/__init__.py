@@ -128,7 +128,8 @@ def _check_options(env: type, backend: Any, world: Any, options: Mapping[str, An
         )
     if isinstance(backend, str):
         raise InputError(f"The backend is {backend!r:.40}: name a world by world=.")
-    check_settings(**{name: options[name] for name in ("actions", "max_chunks") if name in options})
+    checked = ("actions", "observe", "max_chunks")
+    check_settings(**{name: options[name] for name in checked if name in options})
     known = ["backend", "world", *(n for n in signature(env).parameters if n not in _POSITIONAL)]
     if unknown := [name for name in options if name not in known]:
         raise InputError(

@@ -55,8 +55,12 @@ OPTIONS = ("start", "episode", "state", "prompt")
 CLOSED = "The environment is closed: make a new one."
 
 
-def check_settings(*, actions: Any = None, max_chunks: Any = 1) -> None:
+def check_settings(*, actions: Any = None, observe: Any = (), max_chunks: Any = 1) -> None:
     """Raise `InputError` for settings that an environment cannot have."""
+    if isinstance(observe, str):
+        raise InputError(
+            f"observe is the text {observe!r:.40}: give a tuple of names, such as ('frames',)."
+        )
     if actions is not None and not isinstance(actions, ActionSpec):
         raise InputError(
             f"actions is {actions!r:.40}: it must be an ActionSpec, such as "
@@ -70,10 +74,6 @@ def check_settings(*, actions: Any = None, max_chunks: Any = 1) -> None:
 
 def observation_space(video: VideoSpec, spec: ActionSpec, observe: tuple[str, ...]) -> spaces.Dict:
     """Return the space of the row and the requested observations."""
-    if isinstance(observe, str):
-        raise InputError(
-            f"observe is the text {observe!r:.40}: give a tuple of names, such as ('frames',)."
-        )
     if unknown := [name for name in observe if name not in OBSERVATIONS]:
         raise InputError(
             f"There is no observation {unknown[0]!r:.40}: choose from {', '.join(OBSERVATIONS)}."
@@ -275,7 +275,7 @@ class WorldEnv(gymnasium.Env):
         max_chunks: int = 10,
         render_mode: str | None = None,
     ):
-        check_settings(actions=actions, max_chunks=max_chunks)
+        check_settings(actions=actions, observe=observe, max_chunks=max_chunks)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InputError(
                 f"render_mode is {render_mode!r:.40}: it must be 'rgb_array' or None. The page of "

@@ -71,7 +71,7 @@ class WorldVectorEnv(VectorEnv):
         max_chunks: int = 10,
     ):
         check_counts({"num_envs": num_envs})
-        check_settings(actions=actions, max_chunks=max_chunks)
+        check_settings(actions=actions, observe=observe, max_chunks=max_chunks)
         self.num_envs, self.backend, self.actions = num_envs, backend, actions or ActionSpec()
         self._observe, self._max_chunks = tuple(observe), max_chunks
         self._rewards = [reward] * num_envs if callable(reward) else list(reward)

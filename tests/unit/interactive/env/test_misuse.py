@@ -172,6 +172,7 @@ def test_an_unknown_option_is_refused_before_a_world_is_loaded(vector, capsys):
         ({"max_chunks": -1}, "max_chunks is -1"),
         ({"max_chunks": "a"}, "max_chunks is 'a'"),
         ({"max_chunks": True}, "max_chunks is True"),
+        ({"observe": "depth"}, "observe is the text 'depth': give a tuple"),
         ({"actions": "wrist"}, r"actions is 'wrist': .*ActionSpec\(layout='wrist'\)"),
         ({"world": "true", "backend": painted()}, "Give a backend or a world"),
         ({"backend": "true"}, "name a world by world="),
