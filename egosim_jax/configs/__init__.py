@@ -107,6 +107,8 @@ def release(name: str, *, others: Iterable[str] = ()) -> hub.Release:
     `others` are names of weights without a release, for the message.
     """
     known = releases()
+    if name not in known and (shipped := shipped_weights(name)):
+        raise InputError(f"{name} is in the package, so nothing is fetched: {shipped}.")
     if name not in known:
         near = difflib.get_close_matches(name, [*known, *others], n=1, cutoff=0.0)
         raise InputError(

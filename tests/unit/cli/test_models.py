@@ -97,6 +97,9 @@ def test_every_release_is_of_a_config():
     assert {release.config for release in configs.releases().values()} <= set(configs.names())
     with pytest.raises(InputError, match="Nearest: egosim_14b"):
         configs.release("egosim14b")
+    for name in ("tabletop", "tabletop_student"):
+        with pytest.raises(InputError, match=f"{name} is in the package, so nothing is fetched"):
+            configs.release(name)
 
 
 def test_a_folder_of_another_release_is_refused(served, tmp_path, monkeypatch):
