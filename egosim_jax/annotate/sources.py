@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from egosim_jax.data.clips import VIDEO_SUFFIXES
 from egosim_jax.data.recorded_files import DESCRIPTION, DepthFiles
 from egosim_jax.data.recording import Recording
 from egosim_jax.io.bounded import listing, quote_path
 from egosim_jax.io.segments import probe_long_video
+from egosim_jax.io.video import VIDEO_SUFFIXES
 from egosim_jax.types import InputError
 
 DEPTH_SUFFIXES = {".png": 0.001, ".npy": 1.0}

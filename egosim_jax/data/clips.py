@@ -38,7 +38,7 @@ from egosim_jax.io.decoding import Damage, Decoding
 from egosim_jax.io.images import MAX_IMAGE_BYTES, read_image
 from egosim_jax.io.run import write_text
 from egosim_jax.io.timing import CONVERT
-from egosim_jax.io.video import VideoInfo, probe_video, read_video, write_video
+from egosim_jax.io.video import VIDEO_SUFFIXES, VideoInfo, probe_video, read_video, write_video
 from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import WAN_GRID, InputError, Triplet, VideoGrid, VideoSpec
 
@@ -52,7 +52,6 @@ LENIENT = "egosim generate --lenient"
 """The one command with the lenient policy, and its option."""
 MAX_STRETCH = 1.5
 """Maximum ratio of the factors of the two sides of a video that is resized."""
-VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi")
 
 
 def write_clips(

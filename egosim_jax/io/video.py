@@ -52,6 +52,8 @@ from egosim_jax.io.listing import Listing, list_frames
 from egosim_jax.io.timing import Timeline
 from egosim_jax.types import InputError
 
+VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".webm", ".avi")
+"""Suffixes of the files that are taken for videos."""
 CRF = 10
 """Default quality of x264: 0 is lossless, 10 visually lossless (about 50 dB), 23 x264's own."""
 _SMPTE170M, _LIMITED_RANGE, _BT709, _SRGB = 6, 1, 1, 13

@@ -159,11 +159,14 @@ class Episode:
     def load(cls, path: Path | str) -> Episode:
         """Read a folder or a .zip. Raises `InputError` if it is damaged or not valid."""
         path = Path(path)
-        if path.suffix.lower() in (".mp4", ".mov", ".mkv", ".webm", ".avi"):
-            raise InputError(
-                f"{quote_path(path)} is a video: annotate it (egosim data annotate {path} --out "
-                "CLIPS), and make an episode of a clip (egosim episode from-annotation)."
-            )
+        if path.suffix and path.suffix != ".zip" and not path.is_dir():
+            from egosim_jax.io.video import VIDEO_SUFFIXES
+
+            if path.suffix.lower() in VIDEO_SUFFIXES:
+                raise InputError(
+                    f"{quote_path(path)} is a video: annotate it (egosim data annotate {path} "
+                    "--out CLIPS), and make an episode of a clip (egosim episode from-annotation)."
+                )
         data = None if path.is_dir() else read_bytes(path, limit=MAX_BYTES)  # names the path
         if data is None and not (path / DESCRIPTION).exists():
             other = next((text for name, text in OTHERS.items() if (path / name).exists()), "")
