@@ -33,6 +33,7 @@ from egosim_jax.interactive.server.parts import PartResult, Parts
 from egosim_jax.interactive.server.session import Result, Session
 from egosim_jax.rendering.mesh import Side
 from egosim_jax.simulation.actions import places_of
+from egosim_jax.simulation.changes import moved_objects
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.simulation.start import Start, check_size
 from egosim_jax.types import Action, Cameras, InputError, SceneState
@@ -236,6 +237,14 @@ class PlayedEpisode:
         cameras = straight_path(row[-6:], camera, len(poses) + 1)
         rows = [pose.row(self.side, own) for pose, own in zip(poses, cameras, strict=True)]
         return np.clip(rows, *self.session.actions.bounds)
+
+    def account(self) -> list[str]:
+        """Return what perception noted of the last clip, and the objects that it moved."""
+        if not self.at:
+            return []
+        before, after = (self.moments[n].start.state for n in (self.at - 1, self.at))
+        moved = moved_objects(before, after)
+        return [*self.session.result.info["notes"], *map(str, moved)]
 
     def go_to(self, number: int) -> None:
         """Return to a moment; the next clip continues from there."""

@@ -253,10 +253,13 @@ class Page:
                 self._status.content = "Updating the state…"
 
         timing = make(show)
-        self._status.content = (
-            f"{quote_text(caption)}  \nFirst frame after {timing.first_s:.1f} s, last after "
-            f"{timing.last_s:.1f} s; state updated after {timing.total_s:.1f} s."
-        )
+        lines = [
+            caption,
+            f"First frame after {timing.first_s:.1f} s, last after {timing.last_s:.1f} s; state "
+            f"updated after {timing.total_s:.1f} s.",
+            *self.played.account(),
+        ]
+        self._status.content = "  \n".join(map(quote_text, lines))
         self._refresh()
         self._replay_later([self.played.now])
 
@@ -335,6 +338,7 @@ class Page:
     def _go_to(self, number: int) -> None:
         if number != self.played.at:
             self.played.go_to(number)
+            self._status.content = quote_text(self.played.now.caption)
             self._refresh()
 
     def _undo(self) -> None:

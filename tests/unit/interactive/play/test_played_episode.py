@@ -57,6 +57,19 @@ def test_frames_are_shown_as_they_come_and_truth_is_filmed(played):
     assert np.abs(moved).max() > 0.01
 
 
+def test_the_account_of_a_clip_has_the_notes_and_what_moved(tmp_path):
+    world = PaintedWorld(generator=Showing(), video=VIDEO, perception="classical")
+    start = tabletop_start(0, ActionSpec(camera=True), VIDEO)
+    played = PlayedEpisode(world, tmp_path, start, "right")
+    assert played.account() == []
+    carry(played)
+    name, _ = played.goal
+    *_, moved = played.account()
+    assert moved.startswith(f"{name}: moved by ")
+    played.go_to(0)
+    assert played.account() == []
+
+
 def test_a_closed_episode_films_what_was_asked_of_it_and_no_more(played):
     carry(played)
     played.close()
