@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -17,13 +18,17 @@ def printable(text: object) -> str:
 
 
 def make_console(*, width: int | None = None) -> Console:
-    """Return a console that prints tables of untrusted text: escaped, and without markup."""
+    """Return a console that prints tables of untrusted text: escaped, and without markup.
+
+    `width` is for files and pipes. A terminal has one, to which tables are folded.
+    """
     from rich.console import Console
 
     class PlainConsole(Console):
         def render_str(self, text: str, **options: object) -> object:  # pyright: ignore
             return super().render_str(printable(text), **options)  # pyright: ignore
 
+    width = None if sys.stdout.isatty() else width
     return PlainConsole(width=width, markup=False, emoji=False, highlight=False)
 
 
