@@ -104,6 +104,7 @@ class Play:
             with phase("opens the page"):
                 server = self._serve()
             Page(server, begin, PlayedEpisode(world, self.out, start, self.hand))
+            print("ready; Ctrl-C ends it", file=sys.stderr, flush=True)
             print(f"http://127.0.0.1:{server.get_port()}", flush=True)
             _wait()
             server.stop()

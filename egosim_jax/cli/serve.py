@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -132,4 +133,5 @@ class Serve:
         )
 
     def _ready(self, port: int) -> None:
+        print("ready; Ctrl-C ends it, after the steps in progress", file=sys.stderr, flush=True)
         print(f"http://{self.host}:{port}", flush=True)
