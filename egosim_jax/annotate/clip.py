@@ -181,7 +181,8 @@ def _run_stages(
     stored = [stage.name for stage in chosen if stage.stored]
     if first_only and all(name in journal.done for name in stored):
         return None
-    record = open_record(job, config)
+    with phase(f"{job.video_id}: reads the video", only_if_long=True):
+        record = open_record(job, config)
     times = notes.setdefault("seconds", {})
     for number, stage in enumerate(chosen, start=1):
         cv2.setRNGSeed(config.seed % 2**31)  # per stage: a resumed clip gets the same results
