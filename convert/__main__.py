@@ -8,19 +8,13 @@ interrupts.expect()
 
 import sys
 from collections.abc import Sequence
-from typing import Annotated
 
-import tyro
-
-from egosim_jax.convert.commands import Inspect, Lora, ToTorch, Verify, Weights
+from egosim_jax.convert.commands import Inspect, Lora, ToTorch, Weights
+from egosim_jax.convert.verify import Verify
 from egosim_jax.runtime import command
 
-Commands = (
-    Annotated[Inspect, tyro.conf.subcommand("inspect")]
-    | Annotated[Weights, tyro.conf.subcommand("weights")]
-    | Annotated[Lora, tyro.conf.subcommand("lora")]
-    | Annotated[ToTorch, tyro.conf.subcommand("to-torch")]
-    | Annotated[Verify, tyro.conf.subcommand("verify")]
+Commands = command.subcommands(
+    {"inspect": Inspect, "weights": Weights, "lora": Lora, "to-torch": ToTorch, "verify": Verify}
 )
 
 

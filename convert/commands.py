@@ -15,27 +15,24 @@ from egosim_jax.convert.detect import DetectedNetwork, detect, known_tables
 from egosim_jax.convert.plan import fits, network_config, to_jax, to_torch, widening_of
 from egosim_jax.convert.source import tokenizer_files
 from egosim_jax.convert.tables import pipeline_files, table_of
-from egosim_jax.convert.widen import Widening, WidenMode
+from egosim_jax.convert.widen import WidenMode
 from egosim_jax.convert.writer import (
     Weight,
     apart,
     in_memory,
-    in_rows,
     write_file,
     write_sharded,
 )
 from egosim_jax.io.atomic import atomic_folder, lock_folder
 from egosim_jax.io.bounded import quote_path
-from egosim_jax.io.mapped import OURS, Tensor
+from egosim_jax.io.mapped import OURS
 from egosim_jax.io.run import write_json
-from egosim_jax.io.weights import WeightsError, hashes, link_others, mismatches
+from egosim_jax.io.weights import add_others, hashes
 from egosim_jax.runtime import command
-from egosim_jax.runtime.progress import track
 from egosim_jax.runtime.terminal import make_console, printable
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
-    from egosim_jax.configs.model import ModelConfig
     from egosim_jax.models import NetworkConfig
     from egosim_jax.models.lora import Change
 
@@ -118,10 +115,12 @@ class Weights:
     `polarity` converts the base's mask (Wan: 1 = keep) to the model's; `copy` assumes that both
     are equal."""
 
-    def run(self, *, keep_logs: bool = False) -> int:
-        """Detect, check and write the networks; with `keep_logs`, only incomplete ones."""
+    def plan(self) -> tuple[list[tuple[DetectedNetwork, list[Weight]]], dict[str, bytes], str]:
+        """Return networks and their weights, files of the tokenizer, and names of other networks.
+
+        Only headers are read. Raises `InputError` if the checkpoint cannot be converted.
+        """
         from egosim_jax import configs
-        from egosim_jax.configs.model import metadata_of
 
         config = configs.get(self.config)
         folder = detect(self.source, config).only(self.prefix)
@@ -131,20 +130,12 @@ class Weights:
         if not names:
             has = f"only {needless}, which {self.config} lacks" if needless else "no known network"
             raise InputError(f"{quote_path(self.source)} holds {has}. (egosim convert inspect)")
-        if needless and not self.only:
-            print(f"skipped, as {self.config} lacks it: {needless}", file=sys.stderr)
         apart(self.out, self.source)
         planned = []
         for found in map(folder.network, names):
-            widening = _widening(found, config, self.widen)
+            widening = widening_of(config, found.network, self.widen)
             weights = to_jax(found, config, dtype=self.dtype, widening=widening)
             planned.append((found, weights))
-            if found.low_rank:
-                print(
-                    f"{found.source.name}: skipped {len(found.low_rank)} tensors of a LoRA on its "
-                    "layers. Merge it with `egosim convert lora --merge`.",
-                    file=sys.stderr,
-                )
             for file in found.source.files:
                 apart(self.out / f"{found.network}.safetensors", file)
         if not self.only:
@@ -152,13 +143,30 @@ class Weights:
         kept = {}
         if folder.tokenizer is not None and "text" in names and config.tokenizer.kind != "byt5":
             kept = tokenizer_files(folder.tokenizer, within=self.source)
+        return planned, kept, needless
+
+    def run(self) -> int:
+        """Detect, check and write the networks."""
+        from egosim_jax import configs
+        from egosim_jax.configs.model import metadata_of
+
+        config = configs.get(self.config)
+        planned, kept, needless = self.plan()
+        if needless and not self.only:
+            print(f"skipped, as {self.config} lacks it: {needless}", file=sys.stderr)
         with lock_folder(self.out):
             for found, weights in planned:
+                if found.low_rank:
+                    print(
+                        f"{found.source.name}: skipped {len(found.low_rank)} tensors of a LoRA on "
+                        "its layers. Merge it with `egosim convert lora --merge`.",
+                        file=sys.stderr,
+                    )
                 target = self.out / f"{found.network}.safetensors"
                 metadata = {"format": OURS, "config": self.config, "source": found.source.name}
                 metadata |= metadata_of(found.network, config.chunks)
-                origin = found.source.files
-                write_file(target, weights, origin=origin, metadata=metadata, keep_log=keep_logs)
+                origin, settings = found.source.files, (self.prefix, self.widen)
+                write_file(target, weights, origin=origin, metadata=metadata, settings=settings)
             if kept:
                 with atomic_folder(self.out / config.tokenizer.kind) as temporary:
                     for name, data in kept.items():
@@ -229,7 +237,7 @@ class Lora:
     config: str
     """Name of the LoRA's model."""
     out: Path
-    """File to write; with --merge, a weights folder whose other networks are symlinks."""
+    """File to write; with --merge, a weights folder with the other networks of that one."""
     merge: Path | None = None
     """Weights folder to merge the LoRA into."""
     scale: float = 1.0
@@ -240,23 +248,25 @@ class Lora:
     """Text before the names, such as `ema`, if the file has several LoRAs."""
     adapter: str | None = None
     """Name of PEFT's adapter, if the file has several."""
-    layout: Literal["dwm"] | None = None
-    """Layout instead of one file; `dwm` writes a folder like DWM's checkpoints.
+    layout: Literal["dwm", "egosim"] | None = None
+    """Layout instead of ComfyUI's names; `egosim` is ours, for `egosim train --lora`.
 
-    It has a LoRA in the names of PEFT or, on Wan, of VideoX-Fun, and the patch projection."""
+    `dwm` writes a folder like DWM's checkpoints. It has a LoRA in the names of PEFT or, on Wan, of
+    VideoX-Fun, and the patch projection."""
 
     def run(self) -> int:
         """Read, check and write the LoRA."""
         from egosim_jax import configs
-        from egosim_jax.configs.model import metadata_of
         from egosim_jax.convert.lora import base_of, check_base, read_lora
-        from egosim_jax.convert.lora_export import exported, exported_metadata
-        from egosim_jax.convert.plan import merged
-        from egosim_jax.io.mapped import read_safetensors
-        from egosim_jax.models.lora import BASE, check_scale
+        from egosim_jax.models import lora
 
         config = configs.get(self.config).dit
-        check_scale(self.scale)
+        lora.check_scale(self.scale)
+        if self.layout and self.merge is not None:
+            raise InputError(
+                f"--merge and --layout {self.layout} exclude each other: merged weights are in our "
+                "layout. Omit one of them."
+            )
         for source in (self.source, self.merge):
             if source is not None:
                 apart(self.out, source)
@@ -267,128 +277,51 @@ class Lora:
         origin = [self.source]
         if self.source.is_dir():
             origin = sorted(file for file in self.source.iterdir() if file.is_file())
-        known = next(iter(base), None) or base_of(self.source)
-        trained_on = {} if known is None else {BASE: known}
-        if self.layout == "dwm":
-            return self._write_checkpoint(changes, config, origin, trained_on)
-        if self.merge is None:
-            metadata = exported_metadata(changes) | trained_on
-            weights = in_memory(exported(changes, config))
-            with lock_folder(self.out.parent):
-                write_file(self.out, weights, origin=origin, metadata=metadata)
-            return command.ExitCode.DONE
-        file = self.merge / "dit.safetensors"
-        weights = merged(read_safetensors(file), changes, config, scale=self.scale)
-        metadata = {"format": OURS, "config": self.config, "lora": quote_path(self.source.name)}
-        metadata |= metadata_of("dit", configs.get(self.config).chunks)
-        with lock_folder(self.out):
-            write_file(self.out / file.name, weights, origin=[file, *origin], metadata=metadata)
-            link_others(self.out, self.merge)
+        files = self._files(changes, config, next(iter(base), None) or base_of(self.source))
+        settings = (self.prefix, self.adapter, self.scale)
+        with lock_folder(next(iter(files)).parent):
+            for file, (weights, metadata) in files.items():
+                used = origin if self.merge is None else [self.merge / file.name, *origin]
+                write_file(file, weights, origin=used, metadata=metadata, settings=settings)
+            if self.merge is not None:
+                add_others(self.out, self.merge)
         return command.ExitCode.DONE
 
-    def _write_checkpoint(
-        self,
-        changes: Mapping[str, Change],
-        config: NetworkConfig,
-        origin: Sequence[Path],
-        trained_on: Mapping[str, str],
-    ) -> int:
-        """Write a folder in the layout of DWM's checkpoints."""
-        from egosim_jax.convert.lora_export import checkpoint
-        from egosim_jax.io.mapped import read_safetensors
-
-        if self.merge is not None:
-            raise InputError(
-                "--merge and --layout dwm exclude each other: a checkpoint is not merged. Omit one "
-                "of them."
-            )
-        base = None if self.base is None else read_safetensors(self.base / "dit.safetensors")
-        with lock_folder(self.out):
-            for stem, tensors in checkpoint(changes, config, base).items():
-                target = self.out / f"{stem}.safetensors"
-                weights = in_memory(tensors)
-                metadata = {"format": "pt", **trained_on}
-                write_file(target, weights, origin=origin, metadata=metadata)
-        return command.ExitCode.DONE
-
-
-@dataclass(frozen=True, kw_only=True)
-class Verify:
-    """Compare a weights folder with the checkpoint that it was converted from.
-
-    Every value must equal the source's bit for bit, after the change of layout and dtype, and match
-    its checksum. With torch, diffusers and transformers installed, it also compares one forward of
-    each network.
-    """
-
-    source: Annotated[Path, tyro.conf.Positional]
-    """File in .safetensors or .pth format, or folder of them."""
-    weights: Annotated[Path, tyro.conf.Positional]
-    """Weights folder converted from it."""
-    config: str
-    """Name of the model."""
-    prefix: str | None = None
-    """Value of --prefix in the conversion."""
-    widen: WidenMode | None = None
-    """Value of --widen in the conversion."""
-
-    def run(self) -> int:
-        """Compare the weights; return 1 if any differs."""
+    def _files(
+        self, changes: Mapping[str, Change], config: NetworkConfig, base: str | None
+    ) -> dict[Path, tuple[Sequence[Weight], Mapping[str, str]]]:
+        """Return weights and metadata of the files to write; `base` is the hash of their base."""
         from egosim_jax import configs
-        from egosim_jax.convert import reference
+        from egosim_jax.configs.model import metadata_of
+        from egosim_jax.convert.lora_export import checkpoint, exported, exported_metadata
+        from egosim_jax.convert.plan import merged
         from egosim_jax.io.mapped import read_safetensors
+        from egosim_jax.models import lora
 
-        config = configs.get(self.config)
-        wrong = []
-        folder = detect(self.source, config).only(self.prefix)
-        files = {f.network: self.weights / f"{f.network}.safetensors" for f in folder.found}
-        if not any(file.exists() for file in files.values()):
+        trained_on = {} if base is None else {lora.BASE: base}
+        ours = {"format": OURS, "config": self.config}
+        ours |= metadata_of("dit", configs.get(self.config).chunks)
+        if self.merge is not None:
+            before = read_safetensors(self.merge / "dit.safetensors")
+            weights = merged(before, changes, config, scale=self.scale)
+            metadata = ours | {"lora": quote_path(self.source.name)}
+            return {self.out / "dit.safetensors": (weights, metadata)}
+        if self.layout == "dwm":
+            before = None if self.base is None else read_safetensors(self.base / "dit.safetensors")
+            metadata = {"format": "pt"} | trained_on
+            return {
+                self.out / f"{stem}.safetensors": (in_memory(tensors), metadata)
+                for stem, tensors in checkpoint(changes, config, before).items()
+            }
+        if self.layout is None:
+            weights, metadata = in_memory(exported(changes, config)), exported_metadata(changes)
+            return {self.out: (weights, metadata | trained_on)}
+        if base is None:
             raise InputError(
-                f"{quote_path(self.weights)} has none of the networks of "
-                f"{quote_path(self.source)}, {', '.join(files) or 'which has none'}."
+                f"{quote_path(self.source)} does not say which weights it was trained on: give "
+                "them. (--base)"
             )
-        for found in map(folder.network, files):
-            file = files[found.network]
-            if not file.exists():
-                print(f"{found.network}: not converted")
-                continue
-            widening = _widening(found, config, self.widen)
-            # `_same` casts each piece to the dtype in the file: any dtype does here.
-            weights = to_jax(found, config, dtype="float32", widening=widening)
-            tensors = read_safetensors(file)
-            if problems := mismatches(tensors, {w.name: w.shape for w in weights}):
-                raise WeightsError(problems, source=str(file))
-            damaged = [name for name, tensor in tensors.items() if not tensor.intact]
-            wrong += [f"{found.network}: {name} does not match its checksum" for name in damaged]
-            if not any(tensor.checksums for tensor in tensors.values()):
-                print(f"{found.network}: no checksums; converting again adds them")
-            differ = [
-                weight.name
-                for weight in track(weights, f"comparing {found.network}", total=len(weights))
-                if weight.name not in damaged and not _same(weight, tensors[weight.name])
-            ]
-            equal = len(weights) - len(differ) - len(damaged)
-            print(f"{found.network}: {equal} of {len(weights)} weights equal")
-            wrong += [f"{found.network}: {name} differs" for name in differ]
-            if found.table.reference is None:
-                print(f"{found.network}: no forward compared: its table has no reference")
-            elif reference.possible() and not damaged:
-                network = network_config(config, found.network)
-                error = reference.relative_error(found, file, network, widening=widening)
-                print(f"{found.network}: forward differs from PyTorch's by {error:.1e}")
-                if not error <= reference.TOLERANCE:
-                    wrong.append(f"{found.network}: forward differs by more than rounding")
-        if not reference.possible():
-            print(f"no forward compared: that needs {', '.join(reference.MODULES)}")
-        print(printable("\n".join(wrong)), end="\n" if wrong else "")
-        return command.ExitCode.FAILED if wrong else command.ExitCode.DONE
-
-
-def _widening(
-    found: DetectedNetwork, config: ModelConfig, mode: WidenMode | None
-) -> Widening | None:
-    """Return the widening of a denoiser, or None for other networks and without a mode."""
-    return widening_of(config, mode) if mode and found.network == "dit" else None
+        return {self.out: (in_memory(lora.tensors(changes)), ours | trained_on)}
 
 
 def _hash(folder: Path) -> str:
@@ -397,17 +330,3 @@ def _hash(folder: Path) -> str:
     if not found:
         raise InputError(f"{quote_path(folder)} has no dit.safetensors. (--merge, --base)")
     return found["dit"]
-
-
-def _same(weight: Weight, tensor: Tensor) -> bool:
-    """Return True if the tensor equals the pieces, cast to its dtype, bit for bit."""
-    import numpy as np
-
-    parts = tensor.array().reshape(len(weight.pieces), -1)
-    return all(
-        np.array_equal(
-            in_rows(piece().astype(tensor.dtype, copy=False)).reshape(-1).view(np.uint8),
-            part.view(np.uint8),
-        )
-        for part, piece in zip(parts, weight.pieces, strict=True)
-    )

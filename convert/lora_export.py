@@ -12,8 +12,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from egosim_jax.convert.lora import IN_FULL
-from egosim_jax.convert.lora_names import FULL, locations_by_name
-from egosim_jax.convert.tables import CheckpointNaming, Table, table_of
+from egosim_jax.convert.lora_table import FULL, Location, locations_by_name
+from egosim_jax.convert.tables import CheckpointNaming, table_of
 from egosim_jax.io.bounded import listing
 from egosim_jax.io.mapped import Tensor
 from egosim_jax.models import NetworkConfig
@@ -29,30 +29,24 @@ def exported(changes: Mapping[str, Change], config: NetworkConfig) -> dict[str, 
 
     Raises `InputError` if no naming of the network's table is for LoRA files.
     """
-    namings = table_of(config).namings.values()
-    naming = next((naming for naming in namings if naming.lora_prefix is not None), None)
-    if naming is None:
+    namings = table_of(config).namings.items()
+    name, prefix = next(((n, to.lora_prefix) for n, to in namings if to.lora_prefix), ("", None))
+    if prefix is None:
         raise InputError(f"{config.table} has no naming of LoRA files.")
     if values := [path for path, change in changes.items() if isinstance(change, Value)]:
         raise InputError(
             f"{listing(values)} replace weights of the base, which a LoRA file cannot: merge them "
             "into it. (--merge)"
         )
-    tensors, prefix = {}, naming.lora_prefix
+    naming = CheckpointNaming(naming=name, stem="", prefix=prefix, alpha=True)
+    tensors, full = _named(changes, config, naming)
     suffixes = {kind: suffix for suffix, kind in FULL.items()}
-    known = locations_by_name(config, naming.rules(config))
-    for key, location in known.items():
-        name, _, kind = key.rpartition(".")
-        layer = ... if location.layer is None else location.layer
-        delta, full = changes.get(location.path), changes.get(location.target)
-        if isinstance(delta, Delta) and location.rule.transform == "linear":
-            down, up = delta.down[layer], delta.up[layer]
-            tensors[f"{prefix}{name}.lora_A.weight"] = np.ascontiguousarray(down.T)
-            tensors[f"{prefix}{name}.lora_B.weight"] = np.ascontiguousarray(up.T)
-            tensors[f"{prefix}{name}.alpha"] = np.array(down.shape[-1], np.float32)
-        if isinstance(full, np.ndarray) and full[layer].any():
-            values = location.rule.to_torch(full[layer])
-            tensors[f"{prefix}{name}.{suffixes[kind]}"] = np.ascontiguousarray(values)
+    for key, (at, change) in full.items():
+        layer, _, kind = key.rpartition(".")
+        values = np.asarray(change)[... if at.layer is None else at.layer]
+        if values.any():
+            values = np.ascontiguousarray(at.rule.to_torch(values))
+            tensors[f"{prefix}{layer}.{suffixes[kind]}"] = values
     return tensors
 
 
@@ -71,38 +65,42 @@ def checkpoint(
     A weight that is stored as a difference needs the weights of its base. Raises `InputError` for a
     network without such checkpoints, full weights in the blocks, or a missing base.
     """
-    table = table_of(config)
-    naming = _naming(table, config)
-    files: Files = {naming.stem: {}, IN_FULL: {}}
-    written = set()
-    for key, at in locations_by_name(config, table.rules(naming.naming, config)).items():
-        name, _, kind = key.rpartition(".")
-        layer = ... if at.layer is None else at.layer
-        delta, full = changes.get(at.path), changes.get(at.target)
-        if isinstance(delta, Delta) and at.rule.transform == "linear" and kind == "weight":
-            files[naming.stem] |= naming.tensors(name, delta.down[layer], delta.up[layer])
-            written.add(at.path)
-        if full is not None and not isinstance(full, Delta):
-            if at.layer is not None:
-                raise InputError(
-                    f"{at.target} was trained in full. These checkpoints have full weights only "
-                    "outside the blocks: merge the LoRA instead. (--merge)"
-                )
-            value = _value(at.target, full, base)
-            files[IN_FULL][key] = np.ascontiguousarray(at.rule.to_torch(value))
-            written.add(at.target)
-    if lost := sorted(changes.keys() - written):
-        raise InputError(f"The checkpoint has no names for {listing(lost)}: merge them. (--merge)")
-    return {stem: tensors for stem, tensors in files.items() if tensors}
-
-
-def _naming(table: Table, config: NetworkConfig) -> CheckpointNaming:
-    if table.checkpoint is None:
+    naming = table_of(config).checkpoint
+    if naming is None:
         raise InputError(
             f"{type(config).__name__} has no checkpoints in DWM's layout, only the models dwm_*: "
             "omit the layout. (--layout)"
         )
-    return table.checkpoint
+    low, full = _named(changes, config, naming)
+    values = {}
+    for key, (at, change) in full.items():
+        if at.layer is not None:
+            raise InputError(
+                f"{at.target} was trained in full. These checkpoints have full weights only "
+                "outside the blocks: merge the LoRA instead. (--merge)"
+            )
+        values[key] = np.ascontiguousarray(at.rule.to_torch(_value(at.target, change, base)))
+    return {stem: tensors for stem, tensors in ((naming.stem, low), (IN_FULL, values)) if tensors}
+
+
+def _named(
+    changes: Mapping[str, Change], config: NetworkConfig, naming: CheckpointNaming
+) -> tuple[dict[str, np.ndarray], dict[str, tuple[Location, Value | np.ndarray]]]:
+    """Return low-rank tensors and full changes by their names. Raises `InputError` without one."""
+    tensors, full, written = {}, {}, set()
+    rules = table_of(config).rules(naming.naming, config)
+    for key, at in locations_by_name(config, rules).items():
+        delta, change = changes.get(at.path), changes.get(at.target)
+        if isinstance(delta, Delta) and at.rule.transform == "linear":
+            layer = ... if at.layer is None else at.layer
+            tensors |= naming.tensors(key.rpartition(".")[0], delta.down[layer], delta.up[layer])
+            written.add(at.path)
+        if change is not None and not isinstance(change, Delta):
+            full[key] = at, change
+            written.add(at.target)
+    if lost := sorted(changes.keys() - written):
+        raise InputError(f"The layout has no names for {listing(lost)}: merge them. (--merge)")
+    return tensors, full
 
 
 def _value(

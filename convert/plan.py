@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from egosim_jax.models import NetworkConfig
     from egosim_jax.models.lora import Change
 
+NO_WEIGHTS = ("spiece_model", "*position_ids", "*rope.freqs*", "freqs")
+"""Tensors of files that are no weights: a tokenizer, positions, RoPE's angles."""
+
 
 def to_jax(
     found: DetectedNetwork,
@@ -156,8 +159,13 @@ def merged(
     return weights
 
 
-def widening_of(config: ModelConfig, mode: WidenMode) -> Widening:
-    """Return the widening from a model's base. Raises `InputError` without a narrower base."""
+def widening_of(config: ModelConfig, network: str, mode: WidenMode | None) -> Widening | None:
+    """Return the widening of a model's denoiser from its base; None without a mode, or for others.
+
+    Raises `InputError` without a narrower base.
+    """
+    if mode is None or network != "dit":
+        return None
     table = table_of(config.dit)
     base = table.base
     if base is None:
@@ -235,7 +243,7 @@ def _leaves(found: DetectedNetwork, network: NetworkConfig, *, mixed: bool) -> d
     return assign(
         found.tensors,
         table.rules(found.naming, network),
-        ignore=table.ignored(network),
+        ignore=[*NO_WEIGHTS, *table.ignored(network)],
         want=weight_shapes(network),
         mixed=mixed,
         source=found.source.name,

@@ -60,7 +60,13 @@ def relative_error(
         _readers(found, config, converted, reference),
         cast=dtypes.pop() if len(dtypes) == 1 else None,
     )
-    comparison = Comparison(network=network, config=short, load=checkpoint.load, widening=widening)
+    comparison = Comparison(
+        network=network,
+        config=short,
+        load=checkpoint.load,
+        widening=widening,
+        make=reference.make,
+    )
     with jax.default_matmul_precision("highest"):
         have, want = reference.outputs(comparison)
     size, error = np.linalg.norm(want), np.linalg.norm(have - want)

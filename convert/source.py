@@ -20,7 +20,7 @@ from egosim_jax.types import InputError
 
 INDEX = ".safetensors.index.json"
 SHARD = re.compile(r"(.+)-[0-9]{5}-of-([0-9]{5})")
-PTH = (".pth", ".pt", ".bin")
+PTH = (".pth", ".pt", ".bin", ".ckpt")
 WRAPPER = re.compile(r"(^|(?<=\.))(_orig_mod|_fsdp_wrapped_module|_checkpoint_wrapped_module)\.")
 """Parts that torch's wrappers of modules add to names."""
 TOKENIZER_FILES = (
@@ -119,10 +119,26 @@ def _indexed(index: Path) -> dict[str, str]:
     return weight_map
 
 
+def _read(file: Path) -> Mapping[str, Tensor]:
+    """Return the tensors of a file, by its first bytes and not by its suffix."""
+    start = b""
+    if file.is_file():  # the reader refuses others
+        with file.open("rb") as opened:
+            start = opened.read(9)
+    if start.startswith(b"GGUF"):
+        raise InputError(
+            f"{quote_path(file)} is a GGUF file, whose weights are rounded: give the .safetensors "
+            "or .pth file that it was made from."
+        )
+    if start[8:] != b"{" and start.startswith((b"PK", b"\x80")):  # a zip, or a pickle
+        return read_pth(file)
+    return read_safetensors(file)
+
+
 def _joined(name: str, files: Sequence[Path]) -> Source:
     tensors: dict[str, Tensor] = {}
     for file in files:
-        read = read_pth(file) if file.suffix in PTH else read_safetensors(file)
+        read = _read(file)
         found = {WRAPPER.sub("", name): tensor for name, tensor in read.items()}
         if len(found) < len(read):
             raise InputError(

@@ -1,59 +1,59 @@
 """Writing of safetensors piece by piece: in bounded memory, resumable after an interruption.
 
-A weight consists of pieces, such as the layers of a stack. Their offsets in the file are known in
-advance; a few at a time are read, converted and written. A log next to the growing file has the
-hash of each written piece. The file gets its name when it is complete. The same hashes are the
-checksums in its header.
+A weight consists of pieces, such as the layers of a stack. Threads convert a few at a time, and
+they are appended to a file named after the plan: the tensors, their sources and settings. The same
+plan continues it. A file of ours has its plan in its header, so that a complete one is kept.
 """
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import math
 import mmap
 import os
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from io import FileIO
+from importlib.metadata import version
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from egosim_jax.convert.finite import all_finite, is_floating, out_of_range
 from egosim_jax.convert.source import INDEX
-from egosim_jax.io.atomic import LOG, PART, sync
+from egosim_jax.io.atomic import PART, sync
 from egosim_jax.io.bounded import quote_path
 from egosim_jax.io.mapped import (
     BLANK,
     CODES,
-    HASH,
+    OURS,
     TensorInfo,
-    digest,
     header,
+    read_arrays,
     read_metadata,
-    weights_hash,
+    read_safetensors,
 )
 from egosim_jax.io.run import write_json
 from egosim_jax.runtime.progress import track_bytes
+from egosim_jax.runtime.threads import map_ahead
 from egosim_jax.types import InputError
 
-WORKERS, AHEAD = 2, 3
-"""Number of threads that prepare pieces, and maximum number of pieces in memory."""
+THREADS, AHEAD = 2, 3
+"""Number of threads that convert pieces, and maximum number of pieces in memory."""
+SYNC_BYTES = 256 << 20
+"""Maximum number of bytes, in addition to one piece, that are not on disk yet."""
+PLAN = "plan"
+"""Metadata of our files: hash of the tensors, sources and settings of their conversion."""
 MAX_FILE_BYTES = 5_000_000_000
 """Maximum size of a file in bytes; a larger network becomes several files."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Weight:
+class Weight(TensorInfo):
     """An array to write, with functions that compute its pieces."""
 
-    name: str
-    shape: tuple[int, ...]
-    dtype: np.dtype
     pieces: tuple[Callable[[], np.ndarray], ...]
     """Functions of equal parts along the first axis, or of the full array; cast to `dtype`."""
     names: tuple[str, ...] = ()
@@ -81,176 +81,109 @@ def write(
     *,
     origin: Sequence[Path],
     metadata: Mapping[str, str],
-    keep_log: bool = False,
+    settings: Any = None,
 ) -> Iterator[int]:
     """Write the weights to `target`; yield the size of each piece when it is written.
 
-    The pieces are read from the files `origin`; an incomplete file is resumed only if they have not
-    changed. With `keep_log`, the log of a complete file stays, so the same call recognizes the file
-    and does not write it again. `metadata` goes into the header, which is sealed if the format is
-    ours. If a piece is damaged or not finite, also after its cast, no file remains.
+    The pieces are computed from the files `origin` by these `settings`. An incomplete file of the
+    same plan is continued, and a complete and intact one of ours is kept. `metadata` goes into the
+    header. If a piece is damaged or not finite, also after its cast, no file remains.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     # Wide dtypes first, so that every weight is aligned to its item size.
     ordered = sorted(weights, key=lambda weight: (-weight.dtype.itemsize, weight.name))
-    pieces = [(weight, number) for weight in ordered for number in range(len(weight.pieces))]
-    sizes = [weight.bytes // len(weight.pieces) for weight, _ in pieces]
-    blank = _header(ordered, metadata, len(pieces) * [BLANK], BLANK)
-    plan = _fingerprint(blank, origin)
-    part, log = (target.with_name(target.name + end) for end in (PART, LOG))
-    if keep_log and _complete(
-        target, log, plan, lambda *hashes: _header(ordered, metadata, *hashes), len(pieces)
-    ):
-        yield sum(sizes)
-        return
+    blank = dict.fromkeys((weight.name for weight in ordered), BLANK)
+    plan = _plan(header(ordered, metadata, blank), origin, settings)
+    if ours := metadata.get("format") == OURS:
+        metadata = {**metadata, PLAN: plan}
+        if _is_complete(target, plan):
+            yield sum(weight.bytes for weight in ordered)
+            return
+    part = target.with_name(f"{target.name}.{plan[:16]}{PART}")
+    for other in target.parent.glob(f"{glob.escape(target.name)}.*{PART}"):
+        if other != part:
+            other.unlink()
     try:
-        with _open(part) as file, _open(log) as journal:
-            whole = _Digests([weight.name for weight, _ in pieces])
-            done = _resume(file, journal, plan, start=len(blank), sizes=sizes, whole=whole)
-            journal.truncate(0)  # first, so that an old log never describes a new file
-            if not done:
-                file.truncate(0)
-                file.truncate(len(blank) + sum(sizes))
-            journal.write("\n".join([plan, *done, ""]).encode())
-            yield sum(sizes[: len(done)])
-            offsets = accumulate(sizes, initial=len(blank))
-            left = list(zip(offsets, pieces, strict=False))[len(done) :]
-            put = _put(left, file.fileno())
-            for size, (checksum, data) in zip(sizes[len(done) :], put, strict=True):
-                journal.write(f"{checksum}\n".encode())
-                done.append(checksum)
-                whole.add(checksum, data)
-                del data  # or one more piece stays in memory
-                yield size
-            file.write(_header(ordered, metadata, done, whole.hash_of(ordered)))
+        with open(part, "r+b", opener=_open) as file:
+            file.seek(len(header(ordered, metadata, blank if ours else None)))
+            digests = yield from _append(file, ordered)
+            file.seek(0)
+            file.write(header(ordered, metadata, digests if ours else None))
+            file.flush()
             os.fsync(file.fileno())
     except InputError:
         part.unlink()
-        log.unlink()
         raise
     part.replace(target)
-    if not keep_log:
-        log.unlink()
     sync(target.parent)
 
 
-class _Digests:
-    """SHA-256 of each complete weight, from its pieces in order."""
-
-    def __init__(self, names: Sequence[str]):
-        """Take the name of the weight of each piece."""
-        self._left = list(reversed(names))
-        self._pieces = Counter(names)
-        self._hashes: dict[str, Any] = {}
-        self._digests: dict[str, str] = {}
-
-    def add(self, checksum: str, data: bytes | memoryview) -> None:
-        """Add the next piece and its own hash."""
-        name = self._left.pop()
-        if self._pieces[name] == 1:
-            self._digests[name] = checksum
-            return
-        self._hashes.setdefault(name, hashlib.sha256()).update(data)
-
-    def hash_of(self, weights: Sequence[Weight]) -> str:
-        """Return the `weights_hash` of the weights."""
-        digests = {name: total.hexdigest() for name, total in self._hashes.items()}
-        return weights_hash(_infos(weights), self._digests | digests)
+def _plan(header: bytes, origin: Sequence[Path], settings: Any) -> str:
+    """Return a hash of the header, of path, size and time of the source files, and of settings."""
+    files = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in origin]
+    text = repr((version("egosim-jax"), files, settings))
+    return hashlib.sha256(header + text.encode("utf-8", "surrogateescape")).hexdigest()
 
 
-def _complete(
-    target: Path,
-    log: Path,
-    plan: str,
-    header_of: Callable[[Sequence[str], str], bytes],
-    pieces: int,
-) -> bool:
-    """Return True if a file has the header of the logged pieces, and the log is of the plan."""
-    if not (target.is_file() and log.is_file()):
-        return False
-    logged, *checksums = log.read_text().split("\n")[:-1]
-    if logged != plan or len(checksums) != pieces:
-        return False
+def _is_complete(target: Path, plan: str) -> bool:
+    """Return True if a file of this plan exists, and all its values match their checksums."""
     try:
-        hashed = read_metadata(target).get(HASH, BLANK)
+        if not target.is_file() or read_metadata(target).get(PLAN) != plan:
+            return False
+        for _ in read_arrays(read_safetensors(target).values()):
+            pass
     except InputError:
         return False
-    expected = header_of(checksums, hashed)
-    with target.open("rb") as file:
-        return file.read(len(expected)) == expected
+    return True
 
 
-def _open(path: Path) -> FileIO:
-    """Open a file to read and write; create it if missing; do not follow symlinks."""
-    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
-    return FileIO(os.open(path, flags, 0o666), "r+")
+def _open(path: str, flags: int) -> int:
+    """Open a file; create it if missing; do not follow symlinks."""
+    return os.open(path, flags | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 
-def _infos(weights: Sequence[Weight]) -> list[TensorInfo]:
-    return [TensorInfo(weight.name, weight.shape, weight.dtype) for weight in weights]
+def _append(file: BinaryIO, weights: Sequence[Weight]) -> Generator[int, None, dict[str, str]]:
+    """Write the pieces that a file lacks behind its position; yield the size of each piece.
 
-
-def _header(
-    weights: Sequence[Weight], metadata: Mapping[str, str], pieces: Sequence[str], hashed: str
-) -> bytes:
-    left = iter(pieces)
-    checksums = {weight.name: [next(left) for _ in weight.pieces] for weight in weights}
-    return header(_infos(weights), metadata, checksums, hashed)
-
-
-def _fingerprint(header: bytes, origin: Sequence[Path]) -> str:
-    """Return a hash of the header and of path, size and time of the source files."""
-    files = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in origin]
-    return hashlib.sha256(header + repr(files).encode("utf-8", "surrogateescape")).hexdigest()
-
-
-def _resume(
-    file: FileIO, journal: FileIO, plan: str, *, start: int, sizes: Sequence[int], whole: _Digests
-) -> list[str]:
-    """Return the hashes of the valid leading pieces of an incomplete file; add them to `whole`.
-
-    The file must be of the same plan.
-    After a crash of the machine, the log may list pieces that never reached the disk.
+    Returns the SHA-256 of each weight. The last bytes of an incomplete file are written again:
+    after a crash of the machine, they may not be on disk.
     """
-    lines = journal.read((1 + len(sizes)) * (len(BLANK) + 1)).split(b"\n")
-    valid: list[str] = []
-    if os.fstat(file.fileno()).st_size == start + sum(sizes) and lines[0] == plan.encode():
-        offsets = accumulate(sizes, initial=start)
-        # The last line may be incomplete.
-        for offset, size, logged in zip(offsets, sizes, lines[1:-1], strict=False):
-            data = os.pread(file.fileno(), size, offset)
-            if digest(data).encode() != logged:
-                break
-            valid.append(logged.decode())
-            whole.add(valid[-1], data)
-    journal.seek(0)
-    return valid
+    pieces = [(weight, number) for weight in weights for number in range(len(weight.pieces))]
+    sizes = [weight.bytes // len(weight.pieces) for weight, _ in pieces]
+    digests = {weight.name: hashlib.sha256() for weight in weights}
+    safe = os.fstat(file.fileno()).st_size - SYNC_BYTES
+    ends = accumulate(sizes[1:], initial=file.tell() + sum(sizes[:1]))
+    done = sum(end <= safe for end in ends)
+    for (weight, _), size in zip(pieces[:done], sizes, strict=False):
+        digests[weight.name].update(file.read(size))
+        yield size
+    file.truncate()
+    pending = 0
+    converted = map_ahead(_converted, pieces[done:], threads=THREADS, ahead=AHEAD)
+    for (weight, _), size in zip(pieces[done:], sizes[done:], strict=True):
+        data = next(converted)
+        if pending + size > SYNC_BYTES:
+            file.flush()
+            os.fsync(file.fileno())
+            pending = 0
+        file.write(data)
+        pending += size
+        digests[weight.name].update(data)
+        del data  # or one more piece stays in memory
+        yield size
+    return {name: digest.hexdigest() for name, digest in digests.items()}
 
 
-def _put(pieces: Iterable, file: int) -> Iterator[tuple[str, memoryview]]:
-    """Write the pieces at their offsets, a few in parallel; yield hashes and bytes in order."""
-    with ThreadPoolExecutor(WORKERS) as pool:
-        waiting: list[Future[tuple[str, memoryview]]] = []
-        for offset, piece in pieces:
-            waiting.append(pool.submit(_put_one, file, offset, *piece))
-            if len(waiting) == AHEAD:
-                yield waiting.pop(0).result()
-        for future in waiting:
-            yield future.result()
-
-
-def _put_one(file: int, offset: int, weight: Weight, number: int) -> tuple[str, memoryview]:
+def _converted(piece: tuple[Weight, int]) -> memoryview:
+    """Return the bytes of a piece in its weight's dtype. Raises `InputError` unless finite."""
+    weight, number = piece
     name = weight.names[number] if weight.names else weight.name
     given = weight.pieces[number]()
     with np.errstate(over="ignore", invalid="ignore"):
         array = in_rows(given.astype(weight.dtype, copy=False))
     if not all_finite(array):
         raise out_of_range(given, weight.dtype, name=name, fix=weight.fix)
-    data = array.reshape(-1).view(np.uint8).data
-    written = 0
-    while written < len(data):  # a call writes at most 2 GiB
-        written += os.pwrite(file, data[written:], offset + written)
-    return digest(data), data
+    return array.reshape(-1).view(np.uint8).data
 
 
 def in_rows(x: np.ndarray) -> np.ndarray:
@@ -289,17 +222,19 @@ def write_file(
     *,
     origin: Sequence[Path],
     metadata: Mapping[str, str],
-    keep_log: bool = False,
+    settings: Any = None,
 ) -> None:
-    """Write a file of weights with progress; print its path."""
+    """Write a file of weights with progress (`write`); print its path."""
     total = sum(weight.bytes for weight in weights)
-    pieces = write(target, weights, origin=origin, metadata=metadata, keep_log=keep_log)
+    pieces = write(target, weights, origin=origin, metadata=metadata, settings=settings)
     for _ in track_bytes(pieces, f"writing {target.name}", total=total):
         pass
     print(quote_path(target))
 
 
-def write_sharded(stem: Path, weights: Sequence[Weight], *, origin: Sequence[Path]) -> None:
+def write_sharded(
+    stem: Path, weights: Sequence[Weight], *, origin: Sequence[Path], settings: Any = None
+) -> None:
     """Write one file; above 5 GB, several files and an index."""
     shards: list[list[Weight]] = [[]]
     for weight in weights:
@@ -310,7 +245,7 @@ def write_sharded(stem: Path, weights: Sequence[Weight], *, origin: Sequence[Pat
     for number, shard in enumerate(shards, start=1):
         end = f"-{number:05d}-of-{len(shards):05d}" if len(shards) > 1 else ""
         target = stem.with_name(f"{stem.name}{end}.safetensors")
-        write_file(target, shard, origin=origin, metadata={"format": "pt"})
+        write_file(target, shard, origin=origin, metadata={"format": "pt"}, settings=settings)
         weight_map |= {weight.name: target.name for weight in shard}
     if len(shards) > 1:
         total = sum(weight.bytes for weight in weights)

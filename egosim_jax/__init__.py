@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from egosim_jax.data.metadata import read_metadata
     from egosim_jax.generation.export import write_conditions
     from egosim_jax.generation.generator import Generator
-    from egosim_jax.io.video import write_video
+    from egosim_jax.io.writing import write_video
     from egosim_jax.perception.registry import get as get_perception
     from egosim_jax.perception.registry import register as register_perception
     from egosim_jax.simulation.episode import Episode
@@ -92,7 +92,7 @@ _HOMES = {
     "save_state": ("state.snapshot", "save"),
     "state_from_depth": ("state.depth", "state_from_depth"),
     "write_conditions": ("generation.export", "write_conditions"),
-    "write_video": ("io.video", "write_video"),
+    "write_video": ("io.writing", "write_video"),
     **{name: ("configs.model", name) for name in ("ModelConfig", "Networks")},
     **{name: ("simulation.simulator", name) for name in ("Simulator", "Step")},
     **{
@@ -122,3 +122,7 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, attribute = _HOMES[name]
     return getattr(importlib.import_module(f"{__name__}.{module}"), attribute)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

@@ -21,11 +21,6 @@ UP_AXES: dict[Up, tuple[float, float, float]] = {"z": (0.0, 0.0, 1.0), "-y": (0.
 """Unit vector of each axis that may point up."""
 
 
-def up_of(state: SceneState) -> Up:
-    """Return the axis that points up in a state's world, by its provenance."""
-    return "z" if state.provenance.get("world") == "tabletop" else "-y"
-
-
 def upward(
     state: SceneState, world_from_camera: Float[np.ndarray, "4 4"]
 ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"] | None]:
@@ -34,9 +29,22 @@ def upward(
     Only the tabletop world says where up is. Others may have any axes, so a camera says it: its
     upward direction (-y) is up to 75 degrees from the vertical.
     """
-    if up_of(state) == "z":
-        return np.array(UP_AXES["z"], float), None
+    if state.provenance.get("world") == "tabletop":
+        return np.array(UP_AXES["z"]), None
     return -world_from_camera[:3, 1], world_from_camera[:3, 3]
+
+
+def level_axes(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+    """Return the axes right, forward and up of a world, as columns, for its upward direction.
+
+    Forward is the level direction nearest to y or z, whichever is farther from the vertical: y if z
+    is up, z if -y is up.
+    """
+    up = up / np.linalg.norm(up)
+    forward = np.eye(3)[1 + int(abs(up[1]) > abs(up[2]))]
+    forward = forward - (forward @ up) * up
+    forward /= np.linalg.norm(forward)
+    return np.stack([np.cross(forward, up), forward, up], axis=1)
 
 
 def transform(a_from_b: Float[Any, "*#b 4 4"], points: Float[Any, "*#b n 3"]) -> Any:
@@ -112,6 +120,19 @@ def rotation_angles_deg(a_from_b: Float[np.ndarray, "*b 4 4"]) -> Float[Any, "*b
     """Return the angle of the rotation of each rigid transform, in degrees."""
     cosines = (np.trace(a_from_b[..., :3, :3], axis1=-2, axis2=-1) - 1) / 2
     return np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+
+
+def smallest_rotation(
+    start: Float[np.ndarray, "f 3"], end: Float[np.ndarray, "f 3"]
+) -> Float[np.ndarray, "f 3 3"]:
+    """Return the smallest rotation from one unit vector to another (Rodrigues' formula)."""
+    x, y, z = np.cross(start, end).T
+    cross = np.zeros((len(start), 3, 3))
+    cross[:, [2, 0, 1], [1, 2, 0]] = np.stack([x, y, z], axis=-1)
+    cross[:, [1, 2, 0], [2, 0, 1]] = -np.stack([x, y, z], axis=-1)
+    # Opposite vectors have no unique rotation; the bound keeps the result finite.
+    cosine = np.maximum((start * end).sum(axis=-1), -0.999)
+    return np.eye(3) + cross + cross @ cross / (1 + cosine)[:, None, None]
 
 
 def hinge_rotation(

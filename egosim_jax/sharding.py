@@ -65,8 +65,13 @@ def make_mesh(config: MeshConfig, devices: Sequence[Any] | None = None) -> Mesh:
     return Mesh(arranged, axes, axis_types=(AxisType.Auto,) * 3)
 
 
-def check_batch(size: int, mesh: Mesh | AbstractMesh, grad_accum_steps: int = 1) -> None:
-    """Raise `InputError` unless data x fsdp x `grad_accum_steps` divides a batch."""
+def check_batch(
+    size: int, mesh: Mesh | AbstractMesh, grad_accum_steps: int = 1, *, stage: str | None = None
+) -> None:
+    """Raise `InputError` unless data x fsdp x `grad_accum_steps` divides a batch.
+
+    The message names the options of a training's `stage`.
+    """
     groups = parts("batch", mesh)
     unit = groups * grad_accum_steps
     if size % unit:
@@ -77,9 +82,17 @@ def check_batch(size: int, mesh: Mesh | AbstractMesh, grad_accum_steps: int = 1)
         raise InputError(
             f"A batch of {size} cannot be shared by a mesh of data {mesh.shape['data']} x fsdp "
             f"{mesh.shape['fsdp']}{in_turn}: it must be a multiple of their product, {unit}. "
-            f"{fix} (--batch-size, in training --training.batch-size or "
-            "--training.grad-accum-steps, or another mesh: devices along context share one sample)"
+            f"{fix} {_batch_options(stage)}"
         )
+
+
+def _batch_options(stage: str | None) -> str:
+    if stage is None:
+        return "(--batch-size, or another mesh: devices along context share one sample)"
+    return (
+        f"(--{stage}.batch-size or --{stage}.grad-accum-steps, or another --{stage}.mesh: devices "
+        "along context share one sample)"
+    )
 
 
 def several_devices() -> bool:

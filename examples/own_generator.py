@@ -4,7 +4,7 @@ import numpy as np
 
 import egosim_jax as egosim
 from egosim_jax.types import VideoSpec
-from egosim_jax.worlds.tabletop import make_sequence, to_episode, to_ground_truth
+from egosim_jax.worlds.tabletop import make_sequence, observation_of, to_episode
 
 
 def copy_view(view, action, first_frame, seed):
@@ -16,7 +16,7 @@ video = VideoSpec(frames=17, height=96, width=160, fps=8)
 clips = list(make_sequence(7, spec=video, clips=3))
 episode = to_episode(clips, fps=video.fps)
 oracle = egosim.get_perception("oracle")().build(
-    {step: to_ground_truth(clip) for step, clip in enumerate(clips)}
+    {step: observation_of(clip) for step, clip in enumerate(clips)}
 )
 for name, perception in {"not updated": None, "updated by the oracle": oracle}.items():
     simulator = egosim.Simulator(generator=copy_view, perception=perception, fps=video.fps)

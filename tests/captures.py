@@ -11,6 +11,21 @@ from egosim_jax.geometry import look_at
 FRAMES = 12
 
 
+def coded(count, height=32, width=48):
+    """Return frames whose gray levels are their numbers."""
+    levels = 10 + 240 // count * np.arange(count)
+    return np.broadcast_to(
+        levels.astype(np.uint8)[:, None, None, None], (count, height, width, 3)
+    ).copy()
+
+
+def shown(frames, count):
+    """Return the numbers of frames that were taken out of `count`."""
+    numbers = (frames[:, 2:6, 2:6].mean(axis=(1, 2, 3)) - 10) / (240 // count)
+    np.testing.assert_allclose(numbers, np.rint(numbers), atol=0.4)
+    return np.rint(numbers).astype(int).tolist()
+
+
 class World:
     """A camera that moves by some centimeters, two hands before it, and a textured video."""
 

@@ -58,9 +58,3 @@ def debug_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from egosim_jax.testing import write_weights
 
     return write_weights(tmp_path_factory.mktemp("debug"), configs.get("debug"))
-
-
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draw no curves on the page of a training: they take most of a short one."""
-    monkeypatch.setattr("egosim_jax.train.run_page.draw_curves", lambda plots: b"<svg/>")

@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 
-from egosim_jax.perception.hands.litert import HandNetworks
-from egosim_jax.perception.hands.palms import make_anchors
+from egosim_jax.perception.video.hands.litert import HandNetworks
+from egosim_jax.perception.video.hands.palms import make_anchors
 
 PALM = [0, 1, 2, 5, 9, 13, 17]
 _VISIBLE, _HIDDEN = 250, 150

@@ -30,6 +30,7 @@ class Painter:
     pause: float = 0.0
     renderer = reference
     point_px = 2
+    prior = "static"
 
     def __call__(self, view, action, first_frame, seed):
         time.sleep(self.pause)
@@ -74,7 +75,7 @@ class BatchPainter(ChunkPainter):
 
 @dataclass
 class _PaintedChunks:
-    """Chunks of a clip (`simulator.ClipStream`)."""
+    """Chunks of a clip (`streams.ClipStream`)."""
 
     painter: ChunkPainter
     rng: np.random.Generator
@@ -110,9 +111,11 @@ def painted(perception=None, pause=0.0, batch=None):
 
 def main():
     """Serve the painted world with perception."""
-    from egosim_jax.interactive.server.server import bind, serve
+    from egosim_jax.interactive.options import Limits
+    from egosim_jax.interactive.origins import bind
+    from egosim_jax.interactive.server.server import serve
     from egosim_jax.interactive.server.service import Service
-    from egosim_jax.interactive.server.store import Limits, Store
+    from egosim_jax.interactive.server.store import Store
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)

@@ -86,7 +86,7 @@ def windows_of_hands(folder, grays, **changes):
         replace(clip, video_id=name, hands=np.full_like(clip.hands, gray))
         for name, gray in grays.items()
     ]
-    return windows_of(read_metadata(write_clips(folder, clips, fps=8)), (0,))
+    return windows_of(read_metadata(write_clips(folder, clips, fps=MODEL.video.fps)), (0,))
 
 
 def uncached(monkeypatch):

@@ -12,11 +12,7 @@ Networks belong in `models`, the diffusion objective in `diffusion`, shards and 
     tasks                         networks, examples and loss of each training
     config                        `TrainConfig`, `OptimizerConfig`
     encode, encode_windows        clips to latents shards
-    cached                        DWM's caches to latents shards, and back
     preflight                     compile an update for an absent machine
     monitor, metric_writers       speed, watchdog, skipped updates, sample clips; logs
-    run_page                      index.html of a run
     distributed                   processes of a run
-    launch                        start them on machines without a scheduler
-    bundle, bundle_writer         training on a machine with few packages
 """

@@ -21,8 +21,6 @@ from egosim_jax.types import InputError, MeshConfig, check_counts, check_seed
 
 WeightsDtype = Literal["float32", "bfloat16", "float16"]
 """Dtype of written weights."""
-MAX_START_SHARE = 1 / 3
-"""Maximum share of the first weights in the last moving average of a run without a warm-up."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +54,8 @@ class OptimizerConfig:
     ema_decay: float | None = None
     """Decay of the moving average of the weights (EMA), for instance 0.9999; None: no EMA.
 
-    Validation uses the EMA, and it is written. It takes as much memory as the weights. A decay that
-    is too slow for the run is warmed up (`ema_decay_at`)."""
+    Validation uses the EMA, and it is written. It takes as much memory as the weights. The
+    decay is warmed up (`ema_decay_at`)."""
 
     def __post_init__(self) -> None:
         """Check the range of each number."""
@@ -76,17 +74,13 @@ class OptimizerConfig:
         if decay is not None and not 0 < decay < 1:
             raise InputError(f"ema_decay must be between 0 and 1, not {decay}.")
 
-    def ema_decay_at(self, step: jax.Array, steps: int) -> float | jax.Array:
-        """Return the decay of the moving average at one of `steps` updates; the first is 0.
+    def ema_decay_at(self, step: jax.Array) -> jax.Array:
+        """Return the decay of the moving average at an update; the first is 0.1.
 
-        At a constant decay d, the start still has a share of d ** `steps` in the last average. If
-        this is above `MAX_START_SHARE`, the decay grows with the steps, as min(d, (1 + n) / (10 +
-        n)) (Abadi et al. 2016, `tf.train.ExponentialMovingAverage`).
+        It is min(d, (1 + n) / (10 + n)) at update n, so the start is soon forgotten, whatever the
+        decay d (Abadi et al. 2016, `tf.train.ExponentialMovingAverage`).
         """
-        decay = self.ema_decay or 0.0
-        if decay**steps <= MAX_START_SHARE:
-            return decay
-        return jnp.minimum(decay, (1 + step) / (10 + step))
+        return jnp.minimum(self.ema_decay or 0.0, (1 + step) / (10 + step))
 
 
 @dataclass(frozen=True, kw_only=True)

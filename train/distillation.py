@@ -125,6 +125,8 @@ def check_causal(recipe: FineTuning, file: Path) -> None:
     """Raise `InputError` unless a file's weights are a student's with the recipe's chunks."""
     from egosim_jax.io.weights import check_chunks
 
+    if recipe.lora is not None:
+        recipe.check_lora(*recipe.require("weights"))
     chunks = recipe.model().chunks
     if chunks is None:
         raise InputError(

@@ -1,10 +1,10 @@
-"""Processes of a run: one or many, all with jax's coordination service, which handles SIGTERM.
+"""Processes of a run, one or many, with jax's coordination service; their end after SIGTERM.
 
 Slurm, Open MPI and TPU pods are recognized by jax. Anywhere else, give every process
 
     JAX_COORDINATOR_ADDRESS=host:port JAX_NUM_PROCESSES=n JAX_PROCESS_ID=0..n-1
 
-as `launch` does, and with none of these a run has one process. The service has no authentication.
+With none of these a run has one process. The service has no authentication.
 With an address of this machine's loopback it listens on the loopback only; with any other it
 listens on all interfaces, or on `JAX_COORDINATOR_BIND_ADDRESS`, and needs a firewall
 (docs/security.md). Between several processes, jax's collectives of CPUs (gloo) listen at the
@@ -15,22 +15,24 @@ from __future__ import annotations
 
 import ipaddress
 import itertools
+import json
 import os
 import socket
 import sys
 import threading
 import warnings
-import zlib
 from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
-from jax.experimental import multihost_utils
+
+# jax exports no barrier and no store of its coordination service, and Orbax no store.
+from jax._src.distributed import global_state  # noqa: TID251
 from orbax.checkpoint import multihost
 
+from egosim_jax.runtime import preemption
 from egosim_jax.runtime.command import CommandExit, ExitCode, ProcessExit, run_with_exit_codes
 from egosim_jax.train.peers import HEARTBEAT_S, PEER_DIED, is_peer_failure, run_in_child
 from egosim_jax.types import InputError
@@ -54,7 +56,10 @@ A process that dies meanwhile is noticed as at any other time."""
 LEAVE_S = 10.0
 """Time for which a failing process waits for the others, which may fail too, in seconds."""
 
-_questions = itertools.count(1)
+SCHEDULER = "xla_cpu_enable_concurrency_optimized_scheduler"
+"""XLA's flag for parts of a program that run at the same time on CPUs."""
+
+_calls = itertools.count(1)
 """Numbers of the calls of `is_preempted`, the same in all processes."""
 
 
@@ -62,8 +67,18 @@ _questions = itertools.count(1)
 def distributed_context() -> Iterator[None]:
     """Join the processes of the run before any device is used, and leave them at the end.
 
-    A process that fails alone ends here, so that the others notice it.
+    A process that fails alone ends here, so that the others notice it. SIGTERM is noted for
+    `is_preempted`.
     """
+    # jax's service reports a signal once, to one counter of steps. Orbax calls it as well, with
+    # another counter.
+    jax.config.update("jax_enable_preemption_service", False)
+    with preemption.noting(), _joined():
+        yield
+
+
+@contextmanager
+def _joined() -> Iterator[None]:
     given = {name: os.environ[name] for name in NAMES if name in os.environ}
     if given:
         if missing := [name for name in NAMES if name not in given]:
@@ -101,9 +116,21 @@ def distributed_context() -> Iterator[None]:
 def training_context() -> Iterator[None]:
     """Enter `distributed_context`, in a child process if the run has several processes."""
     if _may_have_peers():
+        _keep_order()
         run_in_child()
     with distributed_context():
         yield
+
+
+def _keep_order() -> None:
+    """Have XLA run the parts of a program for CPUs one after the other, from the next process on.
+
+    It would else begin what depends on nothing, a message within a loop and one after it too, in an
+    order that differs between processes, and gloo knows messages by their order alone.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    if SCHEDULER not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --{SCHEDULER}=false".strip()
 
 
 def _leave(error: BaseException) -> None:
@@ -138,37 +165,61 @@ def wait_for_all(name: str) -> None:
         multihost.sync_global_processes(name, processes=everyone, timeout=FETCH_S)
 
 
-def count_distinct(names: Iterable[str], maximum: int) -> int:
-    """Return how many different names the processes of a run have, each at most `maximum`.
+def count_distinct(names: Iterable[str]) -> int:
+    """Return how many different names the processes of a run have, of a few in each.
 
     All processes must call this together.
     """
-    marks = np.zeros(maximum, np.uint32)
-    for index, name in enumerate(names):
-        marks[index] = zlib.crc32(name.encode()) or 1
-    if jax.process_count() > 1:
-        marks = multihost_utils.process_allgather(marks)
-    return len(np.unique(marks[marks > 0]))
+    here = sorted(names)
+    texts = _exchanged("names", json.dumps(here) if here else "")
+    return len({name for text in texts for name in json.loads(text)})
+
+
+def _exchanged(topic: str, text: str) -> list[str]:
+    """Return what all processes say of a topic; an empty text is not sent.
+
+    All processes must call this equally often, and each waits for the last one. Only hosts take
+    part: a program of devices could run at the same time as an update, whose messages gloo would
+    then confuse with its own.
+    """
+    if jax.process_count() == 1:
+        return [text] if text else []
+    client: Any = global_state.client
+    call = f"{topic}/{next(_calls)}"
+    if text:
+        client.key_value_set(f"{call}/{jax.process_index()}", text)
+    client.wait_at_barrier(topic, FETCH_S * 1000)
+    return [value for _, value in client.key_value_dir_get(call)]
 
 
 def is_preempted() -> bool:
-    """Return whether to save and stop: True once, soon after any process of the run got SIGTERM.
+    """Return whether to save and stop: True in all processes once one of them got SIGTERM.
 
-    All processes must call this equally often, and stop at the same call. False outside of
-    `distributed_context`, where the signal ends the process.
+    All processes must call this equally often, and each waits for the last one. False outside of
+    `preemption.noting`.
     """
-    return multihost_utils.reached_preemption_sync_point(next(_questions))
+    return bool(_exchanged("preempted", "yes" if preemption.is_noted() else ""))
 
 
 def stop_if_preempted(out: Path) -> None:
-    """End a run of one process that got SIGTERM; called where the same command resumes it."""
+    """End a run that is to stop (`is_preempted`), where the same command resumes it."""
     if is_preempted():
-        raise CommandExit(f"{out}: stopped; run the same command again", ExitCode.RESUBMIT)
+        raise CommandExit(_stopped(out), ExitCode.RESUBMIT)
+
+
+def leave_if_preempted(out: Path) -> None:
+    """End this process of a run if it got SIGTERM; called while each works on its own."""
+    if preemption.is_noted():
+        raise ProcessExit(_stopped(out), ExitCode.RESUBMIT)
+
+
+def _stopped(out: Path) -> str:
+    return f"{out}: stopped; run the same command again"
 
 
 def launched_context() -> AbstractContextManager[None]:
-    """Return `training_context` for a process of a launcher, and an empty context otherwise."""
-    return training_context() if _is_launched() else nullcontext()
+    """Return `training_context` for a process of a launcher; otherwise only note SIGTERM."""
+    return training_context() if _is_launched() else preemption.noting()
 
 
 def _is_launched() -> bool:

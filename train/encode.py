@@ -17,6 +17,7 @@ import logging
 import shutil
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from fractions import Fraction
 from functools import partial
 from itertools import groupby
 from operator import itemgetter
@@ -39,6 +40,7 @@ from egosim_jax.data.manifest import MANIFEST, read_manifest
 from egosim_jax.data.mixing import MIXTURE, read_mixture
 from egosim_jax.data.shards import ShardReader, ShardWriter, gather
 from egosim_jax.data.static import check_static
+from egosim_jax.data.transforms import check_rates
 from egosim_jax.generation.compiled import CompiledFn
 from egosim_jax.generation.encoding import Batch, batch_shapes, batches, pack, targets_of
 from egosim_jax.io.bounded import listing, quote
@@ -48,7 +50,7 @@ from egosim_jax.io.weights import hashes
 from egosim_jax.runtime.progress import track
 from egosim_jax.runtime.terminal import printable
 from egosim_jax.sharding import check_batch, shard_params
-from egosim_jax.train.distributed import stop_if_preempted
+from egosim_jax.train.distributed import leave_if_preempted
 from egosim_jax.train.encode_windows import Damaged, PartWindows, Window, read_windows, windows
 from egosim_jax.types import InputError, Triplet, check_counts
 
@@ -169,6 +171,8 @@ def encode_shards(
     count = jax.process_count() if process_count is None else process_count
     if source.manifest.kind == "frames":
         decoding = _packed_decoding(source, decoding)
+        if (fps := source.manifest.fps) is not None:
+            check_rates(Fraction(fps), config.video.fps, source=str(source.folder))
     provenance = {
         "config": config.name,
         "source": source.manifest.fingerprint,
@@ -201,8 +205,7 @@ def encode_shards(
         encode = Encoding(config, networks, mesh)
         progress = _write(encode, missing, source, batch_size, provenance, decoding)
         for _ in track(progress, verb, total=sum(map(len, missing.values()))):
-            if jax.process_count() == 1:
-                stop_if_preempted(out)
+            leave_if_preempted(out)
     _wait_for_all("encoded")
     lists = {part: PartWindows.read(part) for part in parts}
     skipped = sorted({number for listed in lists.values() for number, _ in listed.skipped})

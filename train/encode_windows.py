@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from egosim_jax.configs.model import ModelConfig
+from egosim_jax.data.clip_files import prior_problem
 from egosim_jax.data.manifest import MANIFEST
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.data.transforms import decode_record, video_shape
@@ -94,8 +95,10 @@ def _example(
     number, start = window
     try:
         record = source[number]
+        if problem := prior_problem(record.metadata.get("extra", {}), config.prior):
+            raise InputError(problem)
         arrays: dict[str, Any] = decode_record(
-            record.arrays, config.video, start=start, decoding=decoding
+            record.arrays, config.video, start=start, decoding=decoding, check_rate=True
         )
     except InputError as error:
         return Damaged(window, named(source.name(number), error))

@@ -19,6 +19,7 @@ from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:
     from egosim_jax.configs.model import ModelConfig, Networks
+    from egosim_jax.models.lora import Change
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +66,9 @@ class FineTuning(Recipe):
     rank: int | None = None
     """Rank of a LoRA to train instead of the weights."""
     lora: Path | None = None
-    """LoRA of this rank and of these weights to train further, a run's lora.safetensors."""
+    """LoRA of these weights to train further, a run's lora.safetensors.
+
+    `egosim convert lora --layout egosim` writes such a file from a LoRA of another project."""
     chunks: tuple[int, ...] | None = None
     """Latent frames of each chunk of a causal student; None: the model's.
 
@@ -128,7 +131,7 @@ class FineTuning(Recipe):
 
         model = self.model()
         check_folder(weights, model.name)
-        self.check_lora(weights)
+        lora = self.check_lora(weights)
         latents = self._local_shards(latents)
         validation = None if self.validation is None else self._local_shards(self.validation)
         for shards in (latents, validation):
@@ -140,7 +143,7 @@ class FineTuning(Recipe):
             validation=validation,
             out=out,
             weights=weights,
-            lora=self.lora,
+            lora=lora,
             teacher=self.teacher_folder,
             samples=validation
             and Samples(model=model, latents=validation, vae=weights, count=self.samples),
@@ -148,18 +151,27 @@ class FineTuning(Recipe):
         print(write_trained(trained, out, model=model, start=weights, rank=self.rank))
         return ExitCode.DONE
 
-    def check_lora(self, weights: Path) -> None:
-        """Raise `InputError` for a LoRA of other weights, or without `rank`."""
+    def check_lora(self, weights: Path) -> tuple[Path, Mapping[str, Change]] | None:
+        """Return the LoRA to train further and its changes, if any.
+
+        Raises `InputError` for a LoRA of other weights or in other names, or without `rank`.
+        """
         if self.lora is None:
-            return
+            return None
         from egosim_jax.convert.lora import check_base
+        from egosim_jax.io.bounded import quote_path
         from egosim_jax.io.weights import hashes
+        from egosim_jax.models.lora import read_own
 
         if self.rank is None:
             raise InputError(
                 f"{self.lora} is trained further as a LoRA: give its rank. (--rank, --lora)"
             )
+        convert = f"egosim convert lora {quote_path(self.lora)} --config {self.config} "
+        convert += f"--layout egosim --base {quote_path(weights)} --out lora.safetensors"
+        changes = read_own(self.lora, convert=convert)
         check_base(self.lora, [hashes(weights, only=["dit"])["dit"]])
+        return self.lora, changes
 
     def _local_shards(self, shards: str | Path) -> Path:
         """Return a folder of shards; after a copy from a store, when all processes have theirs."""
@@ -207,7 +219,7 @@ def write_trained(
 ) -> Path:
     """Write OUT/lora.safetensors if `rank` is given, else a complete OUT/weights.
 
-    Of a student, OUT/weights also links the LoRA and its base.
+    Of a student, OUT/weights also has the LoRA and its base.
 
     `start` is the weights folder that the training started from: the base of the LoRA, or the
     source of untrained networks. All processes of the training call it with the same arguments.
@@ -237,12 +249,11 @@ def write_trained(
             )
             if model.chunks is not None:
                 (folder := out / "weights").mkdir(exist_ok=True)
-                (folder / weights.STUDENT).unlink(missing_ok=True)
-                (folder / weights.STUDENT).symlink_to(path.resolve())
-                weights.link_others(folder, start)
+                weights.link_or_copy(path, folder / weights.STUDENT)
+                weights.add_others(folder, start)
         return path
     folder = out / "weights"
     trained.save(folder, dtype=model.dit.dtype)
     if jax.process_index() == 0:
-        weights.link_others(folder, start)
+        weights.add_others(folder, start)
     return folder

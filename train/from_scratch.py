@@ -36,6 +36,8 @@ ENCODE_BATCH = 8
 """Batch size of the encoding."""
 HELD_OUT = 8
 """Interval of held-out clips, if the metadata names none."""
+OF_UPDATES = ("vae", "denoiser", "crop", "dropout", "change_loss_weight", "weights_dtype")
+"""Options that only updates depend on, and not the clips or latents."""
 SYNTHETIC_CLIPS = Path("clips") / "metadata.csv"
 """Metadata of the synthetic clips, in the run folder."""
 
@@ -50,7 +52,7 @@ class FromScratch(Recipe):
     help_groups: ClassVar[HelpGroups] = {
         "preflight report": ("json", "search"),
         "losses and weights": (
-            "crop", "stride", "change_loss_weight", "weights_dtype", "products", "bundle",
+            "crop", "stride", "change_loss_weight", "weights_dtype", "products",
         ),
     }  # fmt: skip
     config: str
@@ -75,11 +77,6 @@ class FromScratch(Recipe):
     """Dtype of the factors of products in the denoiser's training; None: the model's."""
     weights: Path | None = None
     """Weights folder to start from: keep its autoencoder, train its denoiser further."""
-    bundle: Path | None = None
-    """Write code, latents and weights to this new folder, to train the denoiser elsewhere.
-
-    `train/bundle.py` trains there, on a machine with few packages. Starts from the shipped weights,
-    if there are any. Clips and latents stay in OUT, by default BUNDLE_data."""
 
     @abstractmethod
     def frames(self, out: Path) -> Mapping[str, Path]:
@@ -117,9 +114,7 @@ class FromScratch(Recipe):
         return replace(model, dit=replace(model.dit, products=self.products))
 
     def train(self) -> int:
-        """Make the clips, train one stage after the other, and write the weights or a bundle."""
-        if self.bundle is not None and (complete := self._for_bundle(self.bundle)) != self:
-            return complete.train()
+        """Make the clips, train one stage after the other, and write the weights."""
         (out,) = self.require("out")
         check_counts({"--stride": self.stride})
         from egosim_jax.configs.model import Networks
@@ -128,26 +123,14 @@ class FromScratch(Recipe):
         from egosim_jax.train.monitor import Samples
 
         require_single_process(self.config)
-        free = ("products", "preflight", "json", "search", "bundle")
-        open_folder(out, self, mutable=[*resume_mutable("vae", "denoiser"), *free])
+        has_data = any((out / made).exists() for made in ("clips", "frames", "weights"))
+        open_folder(out, self, mutable=self._mutable(out), begun=has_data)
         frames = self.frames(out)
         with phase0("makes the networks"):
             networks = Networks.random(configs.get(self.config), seed=0)
         networks.vae = self._autoencoder(frames, out)
         latents = {split: self._encode(split, frames[split], out) for split in frames}
         data, validation = _join_latents(latents, out / "latents" / "joined"), latents["test"]
-        if self.bundle is not None:
-            from egosim_jax.train.bundle_writer import write_bundle
-
-            write_bundle(
-                self.bundle,
-                self.stages()["denoiser"],
-                latents={"train": data, "test": validation},
-                weights=self.weights or out / "weights",
-                dtype=self.weights_dtype,
-            )
-            print(self.bundle)
-            return ExitCode.DONE
         trained = train(
             *self.stages()["denoiser"],
             data=data,
@@ -155,23 +138,20 @@ class FromScratch(Recipe):
             out=out / "denoiser",
             weights=self.weights,
             samples=Samples(model=self.trained_model(), latents=validation, vae=out / "weights"),
-            run_folder=out,
         )
         networks.dit, networks.text, networks.image = trained.dit, trained.text, trained.image
         networks.save(out / "weights", dtype=self.weights_dtype)
         print(out / "weights")
         return ExitCode.DONE
 
-    def _for_bundle(self, bundle: Path) -> FromScratch:
-        """Return this recipe with a bundle's defaults. Raises `InputError` if BUNDLE exists."""
-        from egosim_jax.train.bundle_writer import check_new
+    def _mutable(self, out: Path) -> list[str]:
+        """Return the options that may change after the data: most of them before the updates."""
+        from egosim_jax.io.checkpoint import has_checkpoint
 
-        check_new(bundle)
-        return replace(
-            self,
-            out=self.out or bundle.with_name(f"{bundle.name}_data"),
-            weights=self.weights or configs.shipped_weights(self.config),
-        )
+        free = ["products", "preflight", "json", "search"]
+        if any(has_checkpoint(out / stage) for stage in ("vae", "denoiser")):
+            return [*free, *resume_mutable("vae", "denoiser")]
+        return [*free, *OF_UPDATES]
 
     def _autoencoder(self, frames: Mapping[str, Path], out: Path) -> WanVAE:
         """Return the trained VAE, with latents of mean 0 and standard deviation 1."""
@@ -199,7 +179,6 @@ class FromScratch(Recipe):
             data=frames["train"],
             validation=frames["test"],
             out=out / "vae",
-            run_folder=out,
         )
         videos = (record.arrays["target"] for record in ShardReader(frames["train"]))
         vae.standardize(*latent_statistics(vae, videos))
@@ -258,7 +237,7 @@ class FromClips(FromScratch):
     def train(self) -> int:
         """Train on the clips. Raises `InputError` without metadata and synthetic clips."""
         if not self.clips:
-            self.require(*(("metadata",) if self.bundle else ("out", "metadata")))
+            self.require("out", "metadata")
         return super().train()
 
     def frames(self, out: Path) -> Mapping[str, Path]:
@@ -274,11 +253,15 @@ class FromClips(FromScratch):
     def _make_clips(self, folder: Path) -> None:
         from egosim_jax.data.clips import write_clips
         from egosim_jax.worlds.tabletop import make_sequence, to_triplet
+        from egosim_jax.worlds.tabletop.dataset import conditions_of
 
         model = configs.get(self.config)
         spec = replace(model.video, frames=self.clip_frames)
         scenes = (next(make_sequence(seed, spec=spec)) for seed in range(self.clips))
-        made = (to_triplet(scene, point_px=model.point_px) for scene in scenes)
+        prior, hands = conditions_of(model)
+        made = (
+            to_triplet(scene, prior=prior, hands=hands, point_px=model.point_px) for scene in scenes
+        )
         splits = ({"split": "test" if n % 4 == 3 else "train"} for n in range(self.clips))
         clips = (replace(clip, extra=extra) for clip, extra in zip(made, splits, strict=True))
         write_clips(folder, clips, fps=spec.fps)
@@ -310,6 +293,29 @@ class FromClips(FromScratch):
                     "another number, 4k + 1. (--clip-frames, --metadata)"
                 ) from error
         return frames
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnAnyDevices(FromClips):
+    """Check an installation: train a small model from scratch, on any number of devices.
+
+    A batch is as large as given, or the next multiple of what the devices share.
+    """
+
+    def run(self) -> int:
+        """Train with batches that the devices can share, or run the preflight."""
+        if self.preflight is not None:
+            return super().run()
+        stages = {name: _shared(training) for name, (_, training) in self.stages().items()}
+        return FromClips.run(replace(self, **stages))
+
+
+def _shared(training: TrainConfig) -> TrainConfig:
+    """Return a training whose batch size is rounded up to what the devices can share."""
+    from egosim_jax.sharding import make_mesh, parts
+
+    unit = parts("batch", make_mesh(training.mesh)) * training.grad_accum_steps
+    return replace(training, batch_size=-(-training.batch_size // unit) * unit)
 
 
 def select_split(items: Sequence[ClipFiles], split: Literal["train", "test"]) -> list[ClipFiles]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -23,7 +24,7 @@ from egosim_jax.train.from_scratch import FromScratch
 from egosim_jax.types import InputError, SceneState
 
 if TYPE_CHECKING:
-    from egosim_jax.simulation.simulator import VideoGenerator
+    from egosim_jax.simulation.streams import VideoGenerator
     from egosim_jax.worlds.tabletop import TabletopClip
 
 FIRST_TRAINED = 1000
@@ -92,9 +93,15 @@ class FromTabletop(FromScratch):
         return frames
 
     def _make(self, split: str, seeds: range, clips: int, out: Path) -> Path:
-        from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards, true_states
+        from egosim_jax.worlds.tabletop.dataset import (
+            DatasetConfig,
+            conditions_of,
+            make_shards,
+            true_states,
+        )
 
         model = configs.get(self.config)
+        prior, hands = ("static", "mesh") if self.twins else conditions_of(model)
         plan = DatasetConfig(
             seeds=tuple(seeds),
             clips=clips,
@@ -102,8 +109,8 @@ class FromTabletop(FromScratch):
             kind="human" if self.twins else "mixed",
             black_cloths=self.black_cloths,
             attempts=self.attempts if split == "train" else 0.0,
-            prior="static" if self.twins else "state",
-            hands="mesh" if self.twins else "skeleton",
+            prior=prior,
+            hands=hands,
             point_px=model.point_px,
         )
         frames = out / "frames" / split
@@ -112,8 +119,12 @@ class FromTabletop(FromScratch):
             # One process: the generator uses all cores.
             workers, states = 1, OwnRollouts.of(self.config, self.weights)
         scenes = make_shards(plan, out=frames, workers=workers, grid=model.grid, states=states)
-        for _ in track(scenes, f"making {split}", total=len(seeds)):
-            stop_if_preempted(out)
+        try:
+            for _ in track(scenes, f"making {split}", total=len(seeds)):
+                stop_if_preempted(out)
+        except BrokenProcessPool:
+            stop_if_preempted(out)  # Slurm's SIGTERM ends the workers, too
+            raise
         return frames
 
 

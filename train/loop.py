@@ -26,20 +26,23 @@ from flax import nnx
 from egosim_jax.data.loader import Loader, make_loader, one_pass
 from egosim_jax.data.mixing import Mixture, open_shards
 from egosim_jax.data.shards import ShardReader
-from egosim_jax.io.checkpoint import Checkpoints
+from egosim_jax.io.checkpoint import Checkpoints, has_checkpoint
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.run import open_folder, write_json
 from egosim_jax.io.weights import hashes, place
 from egosim_jax.models.layers import LowRankParam, init_sharded
-from egosim_jax.models.lora import state_of as lora_state
+from egosim_jax.models.lora import Change, check_further, state_of
 from egosim_jax.runtime.command import CommandExit, ExitCode
 from egosim_jax.runtime.phases import phase
 from egosim_jax.sharding import assemble, batch_sharding, make_mesh, parts, process_rows
 from egosim_jax.train.config import TrainConfig, numerics_only, resume_mutable
-from egosim_jax.train.distributed import count_distinct, is_preempted
+from egosim_jax.train.distributed import (
+    count_distinct,
+    is_preempted,
+    stop_if_preempted,
+)
 from egosim_jax.train.metric_writers import Console, JsonLines, TensorBoard, WandB, Writer
 from egosim_jax.train.monitor import Clock, Samples, SkipMonitor, Watchdog
-from egosim_jax.train.run_page import TIMES, write_page
 from egosim_jax.train.task import Distillation, Task
 from egosim_jax.train.update import Programs, TrainState, mean_metrics, mean_validation
 from egosim_jax.types import InputError
@@ -53,39 +56,40 @@ def train(
     validation: Path | None,
     out: Path,
     weights: Path | None = None,
-    lora: Path | None = None,
+    lora: tuple[Path, Mapping[str, Change]] | None = None,
     teacher: Path | None = None,
     samples: Samples | None = None,
-    run_folder: Path | None = None,
 ) -> Any:
     """Train `task` on the shards in `data`, resuming the run in `out`, and return the networks.
 
     `validation` is a folder of shards to validate on, with fixed noise. `weights` is a folder to
-    start from instead of random weights, `lora` a LoRA of it to train further. `teacher` is the
-    folder of a distillation's teacher, by default the student at its start. OUT gets config.json,
-    environment.json, metrics.jsonl, times.json, checkpoints/ and samples/. `run_folder`, by default
-    OUT, gets index.html, the page of all stages of the run. All processes of a run call this with
-    the same arguments; the first one writes.
+    start from instead of random weights, `lora` a LoRA of it to train further: file and changes.
+    `teacher` is the folder of a distillation's teacher, by default the student at its start. OUT
+    gets config.json, environment.json, metrics.jsonl, times.json, checkpoints/ and samples/. All
+    processes of a run call this with the same arguments; the first one writes.
     """
     training.check_packages()
     digests = None if weights is None else hashes(weights)
     settings = {"task": task, "training": training, "weights": digests}
     if lora is not None:
-        settings["lora"] = sha256(lora)
+        settings["lora"] = sha256(lora[0])
     if teacher is not None:
         settings["teacher"] = hashes(teacher, only=["dit"])
-    mutable = [*resume_mutable("training"), *numerics_only(task, "task")]
-    open_folder(out, settings, mutable=mutable)
+    resumable = [*resume_mutable("training"), *numerics_only(task, "task")]
     mesh, source = make_mesh(training.mesh), open_shards(data)
     programs = Programs.of(task, training, mesh)
+    if lora is not None:
+        check_further(lora[1], programs.state.params)
+    open_folder(out, settings, mutable=resumable, begun=has_checkpoint(out))
     if weights is None and jax.tree.leaves(programs.frozen):
         raise InputError("Frozen weights cannot be random: give a weights folder. (--weights)")
 
     with jax.set_mesh(mesh), ExitStack() as stack:
         run = Run(task, training, programs, source, out, stack)
         run.compile()
+        stop_if_preempted(out)
         with phase0("loads the weights"):
-            state = run.start(weights, lora, teacher)
+            state = run.start(weights, None if lora is None else lora[1], teacher)
         log0(startup_message(state, training, out))
         for name, digest in (digests or {}).items():
             log0(f"{out}: from {name} sha256 {digest[:16]}")
@@ -95,9 +99,10 @@ def train(
             hooks.append(Every(training.validate_every, partial(run.validate, validation)))
         if samples is not None and training.sample_every is not None:
             hooks.append(Every(training.sample_every, partial(run.sample, samples)))
-        hooks.append(Every(training.validate_every, partial(run.write_page, run_folder or out)))
+        hooks.append(Every(training.validate_every, run.write_times))
         if validation is not None and int(state.step) == 0:
             run.validate(validation, 0, state)
+        stop_if_preempted(out)
         state = run.loop(state, hooks)
         log0(f"time spent:\n{run.clock.table()}")
     return run.networks(state)
@@ -154,13 +159,14 @@ class Run:
             self.clock.flops = self.task.flops(self.training.batch_size)
             with phase0("compiles the update"), self.clock.phase("compile"):
                 self.update = self.update.lower(self.programs.state, self.frozen, example).compile()
-            seconds = self.clock.seconds["compile"]
-            log0(f"compiled in {seconds:.1f} s{memory_summary(self.update)}")
-        every = self.training.save_every
-        saved = [step for step in range(done + 1, steps + 1) if step % every == 0 or step == steps]
+            log0(f"compiled in {self.clock.seconds['compile']:.1f} s{memory_summary(self.update)}")
+        every, left = self.training.save_every, range(done + 1, steps + 1)
+        saved = [step for step in left if step % every == 0 or step == steps]
         self.checkpoints.check_room(self.programs.state, saved)
 
-    def start(self, weights: Path | None, lora: Path | None, teacher: Path | None) -> TrainState:
+    def start(
+        self, weights: Path | None, lora: Mapping[str, Change] | None, teacher: Path | None
+    ) -> TrainState:
         """Return the state of the newest checkpoint, or the initial state."""
         with self.clock.phase("start"):
             loaded = None
@@ -168,8 +174,9 @@ class Run:
                 loaded = self._load(weights)
             if not self.checkpoints.steps:
                 if lora is not None:
-                    low_rank = lora_state(lora, self.programs.state.params)
-                    loaded = nnx.merge_state(loaded or nnx.State({}), low_rank)
+                    base = loaded or nnx.State({})
+                    changed = state_of(lora, self.programs.state.params, base)
+                    loaded = nnx.merge_state(base, changed)
                 return self._initial_state(loaded, teacher)
             state = _placed(self.programs.state, self.programs.state_sharding)
             return self.checkpoints.restore(state, self.batches, fallback=self.training.fallback)
@@ -189,10 +196,10 @@ class Run:
             last = step == self.training.steps
             for hook in hooks:
                 hook(step, state, last=last)
-            preempted = is_preempted()  # at every step: all processes must stop at the same one
-            if step % self.training.save_every == 0 or last or preempted:
-                self.save(step, state, wait=last or preempted)
-            if preempted and not last:
+            ends = is_preempted() or last
+            if step % self.training.save_every == 0 or ends:
+                self.save(step, state, wait=ends)
+            if ends and not last:
                 log0(f"time spent:\n{self.clock.table()}")
                 raise CommandExit(
                     f"{self.out}: stopped and saved after step {step}; run it again",
@@ -217,7 +224,7 @@ class Run:
             self.skips.check()
             metrics = mean_metrics(self.pending)
         self.pending = []
-        if bad := count_distinct(list(self.batches.skipped), Loader.MAX_BAD + 1):
+        if bad := count_distinct(self.batches.skipped):
             metrics["skipped_records"] = float(bad)
         self.write(step, {**metrics, **self.clock.tick(step, self.training.steps)})
 
@@ -243,14 +250,10 @@ class Run:
         with self.clock.phase("sample"):
             samples.write(self.networks(state), self.out / "samples", step)
 
-    def write_page(self, folder: Path, step: int, state: TrainState) -> None:
-        """Write times.json and the page of the run."""
-        self.watchdog.rest()
+    def write_times(self, step: int, state: TrainState) -> None:
+        """Write times.json."""
         if is_first():
-            write_json(self.out / TIMES, self.clock.by_phase())
-            page = write_page(folder)
-            if step == self.training.steps:
-                log0(f"curves, sample clips and settings: {page}")
+            write_json(self.out / "times.json", self.clock.by_phase())
 
     def save(self, step: int, state: TrainState, *, wait: bool) -> None:
         """Write a checkpoint in the background; with `wait`, return when it is on disk."""

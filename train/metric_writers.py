@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+import secrets
 import sys
 from collections.abc import Mapping
 from importlib import import_module
 from importlib.util import find_spec
+from math import isfinite
 from pathlib import Path
 from types import ModuleType
 from typing import Protocol, runtime_checkable
 
 from egosim_jax.io.atomic import append_line
-from egosim_jax.io.bounded import read_lines
+from egosim_jax.io.bounded import read_json, read_lines
 from egosim_jax.io.run import write_text
 from egosim_jax.types import InputError
 
@@ -77,8 +79,9 @@ class JsonLines:
         write_text(path, "".join(f"{line}\n" for line in kept))
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Append a line of metrics to the file."""
-        append_line(self.path, {"step": step, **values})
+        """Append a line of metrics to the file; a number that is not finite is null."""
+        numbers = {name: value if isfinite(value) else None for name, value in values.items()}
+        append_line(self.path, {"step": step, **numbers})
 
     def close(self) -> None:
         """Do nothing: every line is already on disk."""
@@ -111,10 +114,14 @@ class WandB:
         wandb = _package("wandb")
         path = folder / "wandb_id.txt"
         if not path.exists():
-            write_text(path, wandb.util.generate_id())
-        known = path.read_text("utf-8")
+            write_text(path, secrets.token_hex(4))
         self._run = wandb.init(
-            project=project, name=name, id=known, resume="allow", dir=str(folder)
+            project=project,
+            name=name,
+            id=path.read_text("utf-8"),
+            resume="allow",
+            dir=str(folder),
+            config=read_json(folder / "config.json"),
         )
 
     def write(self, step: int, values: Mapping[str, float]) -> None:

@@ -189,19 +189,22 @@ class SkipMonitor:
         if self._last is None:
             return
         (step, metrics, records), self._last = self._last, None
-        count = int(metrics["consecutive_skips"])
-        if not count:
+        student = int(metrics["consecutive_skips"])
+        critic = int(metrics.get("critic_consecutive_skips", 0))
+        if not student and not int(metrics.get("critic_skips", 0)):
             return
         names = ", ".join(str(self.source[int(i)].metadata["video_id"]) for i in records)
-        loss, norm = float(metrics["loss"]), float(metrics["grad_norm"])
+        who = "" if student else "critic: "
+        loss, norm = (float(metrics[f"critic_{m}" if who else m]) for m in ("loss", "grad_norm"))
         print(
-            f"step {step} skipped: loss {loss:.4g}, grad_norm {norm:.4g}, records {names}",
+            f"step {step} skipped: {who}loss {loss:.4g}, grad_norm {norm:.4g}, records {names}",
             file=sys.stderr,
             flush=True,
         )
-        if count >= MAX_CONSECUTIVE_SKIPS:
+        if max(student, critic) >= MAX_CONSECUTIVE_SKIPS:
             raise CommandExit(
-                f"{count} updates in a row were skipped, so the run stops. They did not "
+                f"{max(student, critic)} updates in a row were skipped{who and ' by the critic'}, "
+                "so the run stops. They did not "
                 "change the weights: inspect the records above, or lower the learning rate.",
                 ExitCode.FAILED,
             )
@@ -237,7 +240,7 @@ class Samples:
         All processes of the training call it, under its mesh.
         """
         from egosim_jax.data.sheet import SheetClip, draw_sheet
-        from egosim_jax.io.video import write_video
+        from egosim_jax.io.writing import write_video
 
         graph, params = nnx.split(networks)
         generated = self._frames(_generate(graph, params, self._batch, self.model))

@@ -26,9 +26,7 @@ HEARTBEAT_S = 45
 """Time after which a silent process counts as dead, in seconds."""
 HOLD_S = 5.0
 """Time for which the waiting process keeps lines that may be the begin of jax's report."""
-_REPORT = re.compile(
-    rb"^[WEF]\d{4} [^\n]*(?:coordination_service|preemption_sync|client\.h)", re.MULTILINE
-)
+_REPORT = re.compile(rb"^[WEF]\d{4} [^\n]*(?:coordination_service|client\.h)", re.MULTILINE)
 _FATAL = b"JAX distributed service detected fatal errors"
 _LOST = re.compile(
     r"gloo|nccl|connection (?:reset|closed|refused)|socket closed|coordination service"
@@ -52,7 +50,13 @@ def run_in_child() -> None:
         env={**os.environ, CHILD: "1"},
         stderr=subprocess.PIPE,
     )
-    signal.signal(signal.SIGTERM, lambda number, _: child.send_signal(number))
+    sent: list[int] = []
+
+    def send(number: int, _: Any) -> None:
+        sent.append(number)
+        child.send_signal(number)
+
+    signal.signal(signal.SIGTERM, send)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to the child, too
     last = _copy_stderr(child)
     code = child.wait()
@@ -60,6 +64,8 @@ def run_in_child() -> None:
         print(PEER_DIED, file=sys.stderr, flush=True)
         os._exit(ExitCode.RESUBMIT)
     os.write(2, last)
+    if sent and code == -signal.SIGTERM:  # it had not begun
+        os._exit(ExitCode.RESUBMIT)
     if code < 0:
         if code != -signal.SIGKILL:
             signal.signal(-code, signal.SIG_DFL)

@@ -96,7 +96,7 @@ def hosts_of(stage: Stage, target: Target) -> list[Host]:
     """Return the hosts of a target. Raises `InputError` if the target does not fit the mesh."""
     training = stage.training
     mesh = make_mesh(training.mesh, target.devices)
-    check_batch(training.batch_size, mesh, training.grad_accum_steps)
+    check_batch(training.batch_size, mesh, training.grad_accum_steps, stage="training")
     devices = Counter(device.process_index for device in target.devices)
     rows = process_rows(batch_sharding(mesh), training.batch_size)
     return [Host(host=host, devices=devices[host], rows=rows[host]) for host in rows]
@@ -170,8 +170,8 @@ def _fitting(
 
 
 def _order(report: Report) -> tuple[float, int]:
-    """Return the sort key: predicted seconds without overlap, then peak memory."""
-    return report.compute_s + report.memory_s + report.link_s, report.memory.peak
+    """Return the sort key: seconds at the devices' peak, then peak memory."""
+    return report.roofline_s, report.memory.peak
 
 
 def _heading(title: str, stage: Stage, target: Target) -> str:

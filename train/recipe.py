@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from egosim_jax.io.executables import share_with_jax
+from egosim_jax.sharding import check_batch, make_mesh
 from egosim_jax.train.task import Stage
 from egosim_jax.types import InputError
 
@@ -36,8 +37,7 @@ class Recipe(ABC):
                     raise InputError(
                         f"{option} has no effect without --preflight: add it, or omit {option}."
                     )
-            for stage in self.stages().values():
-                stage.training.check_packages()
+            self._check_stages()
             share_with_jax()
             return self.train()
         from egosim_jax.preflight.targets import compile_offline
@@ -45,6 +45,13 @@ class Recipe(ABC):
 
         compile_offline()
         return preflight(self.stages(), self.preflight, as_json=self.json, search=self.search)
+
+    def _check_stages(self) -> None:
+        """Raise `InputError` for a stage that lacks a package or does not fit the devices."""
+        for name, (_, training) in self.stages().items():
+            training.check_packages()
+            mesh, parts = make_mesh(training.mesh), training.grad_accum_steps
+            check_batch(training.batch_size, mesh, parts, stage=name)
 
     def require(self, *names: str) -> list[Any]:
         """Return options that only training needs. Raises `InputError` if one is not given."""

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import replace
 
 from egosim_jax.conditioning.condition import ConditionDropout
+from egosim_jax.runtime.registry import Registry
 from egosim_jax.train.config import OptimizerConfig, TrainConfig
 from egosim_jax.train.fine_tuning import FineTuning
-from egosim_jax.train.from_scratch import FromClips
+from egosim_jax.train.from_scratch import FromClips, OnAnyDevices
 from egosim_jax.train.from_tabletop import FromTabletop
 from egosim_jax.train.recipe import Recipe
 from egosim_jax.train.refine_vae import RefineVAE
 from egosim_jax.train.students import STUDENTS
-from egosim_jax.types import InputError
 
 _FULL = TrainConfig(
     steps=4000,
@@ -270,7 +269,7 @@ _DEBUG = TrainConfig(
     validate_every=20,
 )
 
-DEBUG = FromClips(
+DEBUG = OnAnyDevices(
     config="debug",
     vae=_DEBUG,
     denoiser=replace(_DEBUG, sample_every=10),
@@ -282,7 +281,8 @@ DEBUG = FromClips(
 
     egosim-train debug --out runs/debug
 
-takes minutes on two CPU cores. A clip has three training windows of 9 frames, or two test windows.
+takes minutes on two CPU cores, and on any number of devices: batches grow to a multiple of it. A
+clip has three training windows of 9 frames, or two test windows.
 """
 
 RECIPES: dict[str, tuple[str, Recipe]] = {
@@ -303,9 +303,11 @@ RECIPES: dict[str, tuple[str, Recipe]] = {
 """Recipes by name, each with its line of the help."""
 
 
-def get(name: str) -> Recipe:
-    """Return a recipe by name. Raises `InputError` with the nearest name for an unknown one."""
-    if name not in RECIPES:
-        near = difflib.get_close_matches(name, RECIPES, n=1, cutoff=0.0)
-        raise InputError(f"There is no recipe {name!r}. Nearest: {near[0]}.")
-    return RECIPES[name][1]
+REGISTRY: Registry[Recipe] = Registry(
+    "recipe",
+    "--config",
+    "egosim_jax.recipes",
+    registered={name: recipe for name, (_, recipe) in RECIPES.items()},
+)
+"""Recipes of this package and of others, by name."""
+get = REGISTRY.get

@@ -100,12 +100,14 @@ class RefineVAE(Recipe):
         """Train, and write the weights. If the encoder was trained, standardize its latents."""
         out, frames, start = self.require("out", "frames", "weights")
         from egosim_jax.data.mixing import open_shards
+        from egosim_jax.io.checkpoint import has_checkpoint
         from egosim_jax.io.run import open_folder
         from egosim_jax.train.loop import train
         from egosim_jax.train.tasks.autoencoding import latent_statistics
 
         require_single_process(self.config)
-        open_folder(out, self, mutable=[*resume_mutable("vae"), "preflight", "json", "search"])
+        free = [*resume_mutable("vae"), "preflight", "json", "search"]
+        open_folder(out, self, mutable=free, begun=has_checkpoint(out / "vae"))
         start = widen_decoder(configs.get(self.config).vae, start, out / "start")
         vae = train(
             *self.stages()["vae"],
@@ -113,14 +115,13 @@ class RefineVAE(Recipe):
             validation=frames / "test",
             out=out / "vae",
             weights=start,
-            run_folder=out,
         ).vae
         if self.part == "all":
             videos = (record.arrays["target"] for record in open_shards(frames / "train"))
             vae.standardize(*latent_statistics(vae, videos))
         folder = out / "weights"
         weights.save(folder / "vae.safetensors", vae, dtype=self.weights_dtype)
-        weights.link_others(folder, start)
+        weights.add_others(folder, start)
         print(folder)
         return ExitCode.DONE
 
@@ -144,7 +145,7 @@ def widen_decoder(config: VideoCodecConfig, folder: Path, out: Path) -> Path:
     }
     weights.fill(vae, {**narrow, **wider}, dtype="float32", source=str(file))
     weights.save(out / file.name, vae)
-    weights.link_others(out, folder)
+    weights.add_others(out, folder)
     return out
 
 

@@ -32,6 +32,8 @@ GRAD_NORM_DECAY = 0.98
 """Decay of the running mean of gradient norms; it averages over about 50 updates."""
 MAX_CONSECUTIVE_SKIPS = 3
 """Number of consecutive skipped updates that stops the run."""
+COUNTS = ("consecutive_skips", "critic_skips", "critic_consecutive_skips")
+"""Names of an update's counts among its metrics; the others are averaged."""
 
 
 @no_type_check
@@ -85,7 +87,7 @@ class TrainState:
         params: Any = optax.apply_updates(self.params, updates)
         ema_params: Any = self.ema_params
         if ema_params is not None:
-            decay = training.optimizer.ema_decay_at(self.step, training.steps)
+            decay = training.optimizer.ema_decay_at(self.step)
             ema_params = optax.incremental_update(params, ema_params, 1 - decay)
         # A geometric mean: a spike hardly moves the mean that the guard compares it with.
         norm = jnp.maximum(norm, jnp.finfo(norm.dtype).tiny)
@@ -194,8 +196,13 @@ def _update_critic(
         return advance(critic, loss, batch, keys, own)
 
     critic, rows = jax.lax.scan(step, before, jnp.arange(1, config.updates + 1))
-    means = {f"critic_{name}": rows[name].mean() for name in ("loss", "grad_norm")}
-    return critic, means
+    valid = rows["consecutive_skips"] == 0
+    means = {
+        f"critic_{name}": jnp.where(valid, rows[name], 0).sum() / valid.sum()
+        for name in ("loss", "grad_norm")
+    }
+    skips = {"skips": (~valid).sum(), "consecutive_skips": critic.consecutive_skips}
+    return critic, means | {f"critic_{name}": count for name, count in skips.items()}
 
 
 def _roles(graph: nnx.GraphDef, state: TrainState, frozen: nnx.State) -> Roles:
@@ -238,14 +245,20 @@ def accumulate_gradients(gradient: Callable[..., Any], parts: int) -> Callable[.
 def mean_metrics(rows: Sequence[Mapping[str, jax.Array]]) -> dict[str, float]:
     """Fetch the metrics of updates from the devices; return their means, and the last rate.
 
-    Skipped updates are counted as `skipped_updates` and excluded from the means.
+    Skipped updates are counted as `skipped_updates` and `skipped_critic_updates`, and excluded from
+    the means. A metric without any finite value is omitted.
     """
     fetched = jax.device_get(rows)
     kept = [row for row in fetched if not row["consecutive_skips"]]
-    names = [name for name in fetched[0] if name not in ("consecutive_skips", "lr")]
-    metrics = {name: float(np.mean([row[name] for row in kept])) for name in names if kept}
-    if skipped := len(fetched) - len(kept):
-        metrics["skipped_updates"] = float(skipped)
+    metrics = {}
+    for name in (name for name in fetched[0] if name not in (*COUNTS, "lr")):
+        if values := [row[name] for row in kept if np.isfinite(row[name])]:
+            metrics[name] = float(np.mean(values))
+    skips = {
+        "skipped_updates": len(fetched) - len(kept),
+        "skipped_critic_updates": sum(int(row.get("critic_skips", 0)) for row in fetched),
+    }
+    metrics |= {name: float(count) for name, count in skips.items() if count}
     return {**metrics, "lr": float(fetched[-1]["lr"])}
 
 
@@ -316,7 +329,7 @@ class Programs:
 
         Raises `InputError` if the mesh does not divide the batch.
         """
-        check_batch(training.batch_size, mesh, training.grad_accum_steps)
+        check_batch(training.batch_size, mesh, training.grad_accum_steps, stage="training")
         graph, _, frozen = nnx.split(
             nnx.eval_shape(lambda: task.networks(nnx.Rngs(0))), task.trained, ...
         )

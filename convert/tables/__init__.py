@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -70,6 +70,8 @@ class Comparison:
     """Fill a PyTorch module from the checkpoint; see `reference.Checkpoint.load`."""
     widening: Widening | None
     """Change of the input channels in the conversion, or None."""
+    make: Callable[[Any], Any]
+    """Make the PyTorch module of a config, to be filled by `load`; see `Reference.make`."""
 
     def output(self, *inputs: Any, call: Callable[..., Any] | None = None) -> np.ndarray:
         """Return the output of the network, or of `call(network, *inputs)`."""
@@ -93,12 +95,20 @@ class Reference:
     """Name of the class."""
     arguments: Callable[[Any], dict[str, Any]]
     """Arguments of the class, or of its config, for a network's config."""
-    shorten: Callable[[Any], Any]
+    shorten: Callable[[Any], Any] = lambda config: replace(config, dtype="float32")
     """Float32 config with fewer layers and rows, for a quick forward."""
     outputs: Callable[[Comparison], tuple[np.ndarray, np.ndarray]]
     """Outputs of the converted network and of the PyTorch module for the same random input."""
     model_type: str | None = None
     """Name of the architecture in the configs of transformers."""
+
+    def make(self, config: Any) -> Any:
+        """Return a PyTorch module for a network's config."""
+        kind = getattr(importlib.import_module(self.library), self.kind)
+        arguments = self.arguments(config)
+        if self.model_type is None:
+            return kind(**arguments)
+        return kind(kind.config_class(**arguments))
 
     def config_json(self, config: Any) -> dict[str, Any]:
         """Return the `config.json` that `from_pretrained` reads."""
@@ -180,13 +190,16 @@ class Table:
         raise InputError(f"The network has no layout {layout}. Available: {known}. (--layout)")
 
 
-def vae_outputs(
-    comparison: Comparison, module: Any, *, frames: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the reconstructions of a small random video by a network and an unloaded module."""
+def fewer_layers(config: Any) -> Any:
+    """Return a float32 config with at most `SHORT_LAYERS` layers."""
+    return replace(config, dtype="float32", layers=min(SHORT_LAYERS, config.layers))
+
+
+def vae_outputs(comparison: Comparison, *, frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return both reconstructions of a small random video."""
     import torch
 
-    module = comparison.load(module)
+    module = comparison.load(comparison.make(comparison.config))
     video = np.random.default_rng(0).uniform(-1, 1, (1, frames, 32, 32, 3)).astype(np.float32)
     have = comparison.output(video, call=lambda vae, x: vae.decode(vae.encode(x)))
     with torch.no_grad():

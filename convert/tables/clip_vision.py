@@ -104,18 +104,15 @@ def shorten(config: CLIPVisionConfig) -> CLIPVisionConfig:
 def outputs(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
     """Return both token grids of a random image."""
     import torch
-    from transformers import CLIPVisionConfig as TorchConfig
-    from transformers import CLIPVisionModel
 
     config = comparison.config
     size = (1, config.image_size, config.image_size, 3)
     pixels = np.random.default_rng(0).standard_normal(size, np.float32)
     have = comparison.output(pixels)
-    torch_config = TorchConfig(**arguments(config))
+    module = comparison.load(
+        comparison.make(config), prefix="vision_model.", unused="post_layernorm"
+    )
     with torch.no_grad():
-        module = comparison.load(
-            CLIPVisionModel(torch_config), prefix="vision_model.", unused="post_layernorm"
-        )
         theirs = torch.from_numpy(rearrange(pixels, "b h w c -> b c h w").copy())
         states = module(theirs, output_hidden_states=True)
     return have, states.hidden_states[-1].numpy()

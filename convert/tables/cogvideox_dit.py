@@ -12,12 +12,12 @@ from einops import rearrange
 from egosim_jax.conditioning.layout import COGVIDEOX_INPAINT
 from egosim_jax.convert.rules import Rule, linear_rules, norm_rules
 from egosim_jax.convert.tables import (
-    SHORT_LAYERS,
     CheckpointNaming,
     Comparison,
     Naming,
     Reference,
     Table,
+    fewer_layers,
 )
 from egosim_jax.diffusion.process import VariancePreserving
 from egosim_jax.models.cogvideox.dit import CogVideoXDiTConfig
@@ -95,15 +95,9 @@ def arguments(config: CogVideoXDiTConfig) -> dict[str, Any]:
     }
 
 
-def shorten(config: CogVideoXDiTConfig) -> CogVideoXDiTConfig:
-    """Return a float32 config with fewer layers."""
-    return replace(config, dtype="float32", layers=min(SHORT_LAYERS, config.layers))
-
-
 def outputs(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
     """Return both predictions for one small random clip."""
     import torch
-    from diffusers import CogVideoXTransformer3DModel
     from diffusers.models.embeddings import get_3d_rotary_pos_embed
     from diffusers.pipelines.cogvideo.pipeline_cogvideox import get_resize_crop_region_for_grid
 
@@ -114,7 +108,7 @@ def outputs(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
     t = np.full(1, 500, np.float32)
     have = comparison.output(latents, t, text)
     theirs = latents if widening is None else widening.narrow(latents)
-    module = CogVideoXTransformer3DModel(**arguments(replace(config, in_channels=theirs.shape[-1])))
+    module = comparison.make(replace(config, in_channels=theirs.shape[-1]))
     _, frames, rows, columns, _ = theirs.shape
     grid = rows // PATCH, columns // PATCH
     region = get_resize_crop_region_for_grid(grid, config.base_columns, config.base_rows)
@@ -183,7 +177,7 @@ TABLE = Table(
         library="diffusers",
         kind="CogVideoXTransformer3DModel",
         arguments=arguments,
-        shorten=shorten,
+        shorten=fewer_layers,
         outputs=outputs,
     ),
     check=check,

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from functools import partial
 from typing import Any
-
-import numpy as np
 
 from egosim_jax.convert.rules import Rule
 from egosim_jax.convert.tables import (
-    Comparison,
     Naming,
     Reference,
     Table,
@@ -56,19 +53,6 @@ def arguments(config: CogVideoXVAEConfig) -> dict[str, Any]:
     }
 
 
-def shorten(config: CogVideoXVAEConfig) -> CogVideoXVAEConfig:
-    """Return the config in float32, with all its layers."""
-    return replace(config, dtype="float32")
-
-
-def outputs(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
-    """Return both reconstructions of a small random video."""
-    from diffusers import AutoencoderKLCogVideoX
-
-    module = AutoencoderKLCogVideoX(**arguments(comparison.config))
-    return vae_outputs(comparison, module, frames=9)
-
-
 def _name(path: str, config: CogVideoXVAEConfig) -> str:
     """Return diffusers' name of the weight at a path."""
     half, group, *rest = path.split(".")
@@ -112,8 +96,7 @@ TABLE = Table(
         library="diffusers",
         kind="AutoencoderKLCogVideoX",
         arguments=arguments,
-        shorten=shorten,
-        outputs=outputs,
+        outputs=partial(vae_outputs, frames=9),
     ),
 )
 """Conversions of CogVideoX's VAE."""

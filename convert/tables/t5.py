@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from egosim_jax.convert.rules import Rule
-from egosim_jax.convert.tables import Comparison, Naming, Reference, Table, umt5
-from egosim_jax.models.cogvideox.t5 import T5Config
+from egosim_jax.convert.tables import Naming, Reference, Table, umt5
+from egosim_jax.models.t5 import T5Config
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -30,21 +28,6 @@ def check(tensors: Mapping[str, Tensor]) -> None:
         raise InputError("The text encoder is umT5, not T5. (--config)")
 
 
-def outputs(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
-    """Return both embeddings of random tokens."""
-    import torch
-    from transformers import T5Config as TorchConfig
-    from transformers import T5EncoderModel
-
-    config = comparison.config
-    ids = np.random.default_rng(0).integers(0, config.vocab, (1, umt5.TOKENS), np.int32)
-    have = comparison.output(ids, np.ones(ids.shape, bool))
-    with torch.no_grad():
-        module = comparison.load(T5EncoderModel(TorchConfig(**umt5.arguments(config))))
-        want = module(torch.from_numpy(ids).long())
-    return have, want.last_hidden_state.numpy()
-
-
 TABLE = Table(
     namings={
         "transformers": Naming(
@@ -63,7 +46,7 @@ TABLE = Table(
         kind="T5EncoderModel",
         arguments=umt5.arguments,
         shorten=umt5.shorten,
-        outputs=outputs,
+        outputs=umt5.outputs,
         model_type="t5",
     ),
 )

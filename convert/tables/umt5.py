@@ -10,15 +10,14 @@ import numpy as np
 
 from egosim_jax.convert.rules import Rule
 from egosim_jax.convert.tables import (
-    SHORT_LAYERS,
     SHORT_VOCAB,
     Comparison,
     Naming,
     Reference,
     Table,
+    fewer_layers,
 )
-from egosim_jax.models.t5 import T5Sizes
-from egosim_jax.models.wan.umt5 import UMT5Config
+from egosim_jax.models.t5 import T5Sizes, UMT5Config
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -93,23 +92,19 @@ def arguments(config: T5Sizes) -> dict[str, Any]:
 
 def shorten(config: Sizes) -> Sizes:
     """Return a float32 config with fewer layers and a shorter token table."""
-    layers, vocab = min(SHORT_LAYERS, config.layers), min(SHORT_VOCAB, config.vocab)
-    return replace(config, dtype="float32", layers=layers, vocab=vocab)
+    return replace(fewer_layers(config), vocab=min(SHORT_VOCAB, config.vocab))
 
 
 def outputs(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
     """Return both embeddings of random tokens."""
     import torch
-    from transformers import UMT5Config as TorchConfig
-    from transformers import UMT5EncoderModel
 
     config = comparison.config
     ids = np.random.default_rng(0).integers(0, config.vocab, (1, TOKENS), np.int32)
     mask = np.ones(ids.shape, bool)
     have = comparison.output(ids, mask)
-    torch_config = TorchConfig(**arguments(config))
     with torch.no_grad():
-        module = comparison.load(UMT5EncoderModel(torch_config))
+        module = comparison.load(comparison.make(config))
         want = module(torch.from_numpy(ids).long(), torch.from_numpy(mask).long())
     return have, want.last_hidden_state.numpy()
 

@@ -15,12 +15,12 @@ from einops import rearrange
 from egosim_jax.conditioning.layout import WAN_INPAINT
 from egosim_jax.convert.rules import Rule, linear_rules, norm_rules
 from egosim_jax.convert.tables import (
-    SHORT_LAYERS,
     Comparison,
     Naming,
     Reader,
     Reference,
     Table,
+    fewer_layers,
 )
 from egosim_jax.diffusion.process import RectifiedFlow
 from egosim_jax.models.wan.dit import WanDiTConfig
@@ -136,15 +136,9 @@ def arguments(config: WanDiTConfig) -> dict[str, Any]:
     }
 
 
-def shorten(config: WanDiTConfig) -> WanDiTConfig:
-    """Return a float32 config with fewer layers."""
-    return replace(config, dtype="float32", layers=min(SHORT_LAYERS, config.layers))
-
-
 def outputs(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
     """Return both velocities of one small random clip."""
     import torch
-    from diffusers import WanTransformer3DModel
 
     config, widening = comparison.config, comparison.widening
     draw = np.random.default_rng(0).standard_normal
@@ -154,7 +148,7 @@ def outputs(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
     t = np.full(1, 500, np.float32)
     have = comparison.output(latents, t, text, image)
     theirs = latents if widening is None else widening.narrow(latents)
-    module = WanTransformer3DModel(**arguments(replace(config, in_channels=theirs.shape[-1])))
+    module = comparison.make(replace(config, in_channels=theirs.shape[-1]))
     with torch.no_grad():
         velocity = comparison.load(module)(
             torch.from_numpy(rearrange(theirs, "b f h w c -> b c f h w").copy()),
@@ -221,7 +215,7 @@ TABLE = Table(
         library="diffusers",
         kind="WanTransformer3DModel",
         arguments=arguments,
-        shorten=shorten,
+        shorten=fewer_layers,
         outputs=outputs,
     ),
     base=WAN_INPAINT,

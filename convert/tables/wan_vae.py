@@ -6,14 +6,11 @@ Both follow our module tree: the foreign name is our path with some words replac
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from functools import partial
 from typing import Any
-
-import numpy as np
 
 from egosim_jax.convert.rules import Rule
 from egosim_jax.convert.tables import (
-    Comparison,
     Naming,
     Reader,
     Reference,
@@ -87,19 +84,6 @@ def arguments(config: WanVAEConfig) -> dict[str, Any]:
     }
 
 
-def shorten(config: WanVAEConfig) -> WanVAEConfig:
-    """Return the config in float32, with all its layers."""
-    return replace(config, dtype="float32")
-
-
-def outputs(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
-    """Return both reconstructions of a small random video."""
-    from diffusers import AutoencoderKLWan
-
-    module = AutoencoderKLWan(**arguments(comparison.config))
-    return vae_outputs(comparison, module, frames=5)
-
-
 def to_diffusers(arrays: Mapping[str, Reader], config: WanVAEConfig) -> Mapping[str, Reader] | None:
     """Rename official tensors by diffusers' own table; None for sizes other than the released."""
     from diffusers.loaders import single_file_utils
@@ -156,8 +140,7 @@ TABLE = Table(
         library="diffusers",
         kind="AutoencoderKLWan",
         arguments=arguments,
-        shorten=shorten,
-        outputs=outputs,
+        outputs=partial(vae_outputs, frames=5),
     ),
 )
 """Conversions of the video VAE."""

@@ -211,7 +211,7 @@ def _stored(
         stage.name,
         folder / f"{stage.name}.npz",
         make=lambda: stage.run(record, estimators, config),
-        save=lambda path, found: records.save(path, found, stage.stored, stage.name),
+        save=lambda path, result: records.save(path, result, stage.stored, stage.name),
         load=partial(_load, record=record, stage=stage),
     )
 

@@ -3,8 +3,8 @@
 An estimator is given as `NAME`, or as `NAME=FOLDER` with the weights of a network:
 
     masks     geometry, sam3=FOLDER, grounded-sam3=FOLDER, grounded-sam2=FOLDER,
-              grounded-edgetam=FOLDER                     perception.silhouettes, networks
-    cameras   ladder, depth-anything-3=FOLDER             perception.cameras, networks
+              grounded-edgetam=FOLDER                     perception.video.silhouettes, networks
+    cameras   ladder, depth-anything-3=FOLDER             perception.video.cameras, networks
     depth     sweep, depth-anything=FOLDER, depth-pro=FOLDER, depth-anything-3=FOLDER, files=FOLDER
     caption   any text, or qwen=FOLDER
 
@@ -21,7 +21,7 @@ from typing import Any, Literal, cast, get_args
 from egosim_jax.annotate.frames import Sampling
 from egosim_jax.annotate.prepare import Cutting, check_length
 from egosim_jax.io.bounded import quote
-from egosim_jax.perception.estimates import (
+from egosim_jax.perception.video.estimates import (
     CameraEstimator,
     Captioner,
     ChosenRung,
@@ -29,13 +29,13 @@ from egosim_jax.perception.estimates import (
     HandEstimator,
     Segmenter,
 )
-from egosim_jax.rendering import RendererName
+from egosim_jax.rendering import PriorKind, RendererName
 from egosim_jax.types import InputError, check_seed
 
 Side = Literal["auto", "left", "right"]
 DType = Literal["float32", "bfloat16", "float16"]
 _DEPTH = {
-    "sweep": "perception.depth:SweptDepth",
+    "sweep": "perception.video.depth:SweptDepth",
     "depth-anything": "perception.networks.depth_anything:DepthAnything",
     "depth-pro": "perception.networks.depth_pro:DepthPro",
     "depth-anything-3": "perception.networks.depth_anything_3:DepthAnything3",
@@ -71,17 +71,17 @@ class Estimators:
 
     def prepare(self) -> None:
         """Fetch missing weights now. Raises `InputError` if a package is missing."""
-        from egosim_jax.perception.cameras import CameraLadder
-        from egosim_jax.perception.cameras.colmap import require_pycolmap
-        from egosim_jax.perception.hands import LandmarkHands
-        from egosim_jax.perception.hands.litert import fetch_weights
+        from egosim_jax.perception.video.cameras import CameraLadder
+        from egosim_jax.perception.video.cameras.colmap import require_pycolmap
+        from egosim_jax.perception.video.hands import LandmarkHands
+        from egosim_jax.perception.video.hands.litert import fetch_weights
 
-        for part in vars(self).values():
-            if isinstance(part, LandmarkHands):
-                fetch_weights(part.weights, offline=part.offline)
-            elif isinstance(part, CameraLadder) and part.rung not in ("static", "rotation"):
+        for settings in vars(self).values():
+            if isinstance(settings, LandmarkHands):
+                fetch_weights(settings.weights, offline=settings.offline)
+            elif isinstance(settings, CameraLadder) and settings.rung not in ("static", "rotation"):
                 require_pycolmap()
-            elif (check := getattr(part, "check_installed", None)) is not None:
+            elif (check := getattr(settings, "check_installed", None)) is not None:
                 check()
 
 
@@ -117,6 +117,8 @@ class AnnotateConfig:
     """Rung of the camera ladder to use, instead of trying all."""
     depth: str = "sweep"
     """Depth estimator; depth in the recording takes precedence."""
+    depth_unit_m: float | None = None
+    """Length in meters of a unit of depth files, instead of the recording's or the suffix's."""
     scale: float | None = None
     """Meters per unit of the cameras."""
     camera_height_m: float | None = None
@@ -127,6 +129,8 @@ class AnnotateConfig:
     """Caption of all clips, or a network that writes captions."""
     renderer: RendererName = "jax"
     """Renderer of prior and hands."""
+    prior: PriorKind = "static"
+    """Places of the objects in the prior: as in the first frame, or predicted from the hands."""
     split: str = "train"
     """Value of the metadata column `split`."""
     seed: int = 0
@@ -136,7 +140,12 @@ class AnnotateConfig:
         """Check all settings before any video is read."""
         check_seed(self.seed)
         check_length(self.sampling.num_frames, cut=self.cutting.clips)
-        for name, low in (("focal_px", 1), ("scale", 0), ("camera_height_m", 0)):
+        for name, low in (
+            ("focal_px", 1),
+            ("depth_unit_m", 0),
+            ("scale", 0),
+            ("camera_height_m", 0),
+        ):
             value = getattr(self, name)
             if value is not None and not low < value < 1e6:
                 option = name.removesuffix("_px").removesuffix("_m").replace("_", "-")
@@ -170,8 +179,8 @@ class AnnotateConfig:
 
     def build(self) -> Estimators:
         """Return the estimators; this imports heavy libraries, but loads no network yet."""
-        from egosim_jax.perception.cameras import CameraLadder
-        from egosim_jax.perception.hands import LandmarkHands
+        from egosim_jax.perception.video.cameras import CameraLadder
+        from egosim_jax.perception.video.hands import LandmarkHands
 
         where: dict[str, Any] = {"device": self.device, "dtype": self.dtype}
         segmenter = captioner = None
@@ -218,12 +227,12 @@ def _check_detector(masks: str, detector: Path | None, option: str) -> None:
         )
 
 
-def _find(known: dict[str, str], text: str, option: str) -> tuple[str, Path | None]:
+def _find(names: dict[str, str], text: str, option: str) -> tuple[str, Path | None]:
     """Return name and folder of an estimator. Raises `InputError` listing the known ones."""
     name, equals, folder = text.partition("=")
     bare = name in _BARE
-    if name not in known or bool(equals) == bare or (equals and not folder):
-        shown = ", ".join(n if n in _BARE else f"{n}=FOLDER" for n in known)
+    if name not in names or bool(equals) == bare or (equals and not folder):
+        shown = ", ".join(n if n in _BARE else f"{n}=FOLDER" for n in names)
         raise InputError(f"{option} {quote(text)} must be one of {shown}.")
     if equals and not Path(folder).is_dir():
         raise InputError(f"{option} {quote(text)}: {quote(folder)} is not a folder.")

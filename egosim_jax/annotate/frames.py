@@ -134,7 +134,9 @@ def plan(recording: Recording, sampling: Sampling, *, cut: bool) -> Plan:
     fps = recording.fps / ceil(recording.fps / MAX_FPS)
     if sampling.fps is not None:
         fps = Fraction(sampling.fps).limit_denominator(1001)
-    count = int((recording.frames - 1) * fps / recording.fps + Fraction(1, 2)) + 1
+    half = Fraction(1, 2)
+    count = int((recording.frames - 1) * fps / recording.fps + half) + 1
+    count = min(count, ceil((recording.frames - half) * fps / recording.fps))  # has a frame
     wanted = sampling.num_frames or MIN_CLIP_FRAMES
     if count < wanted:
         raise InputError(
@@ -148,9 +150,9 @@ def plan(recording: Recording, sampling: Sampling, *, cut: bool) -> Plan:
             "(--num-frames)."
         )
     source = recording.height, recording.width
-    own = _own_size(recording)
-    fix = f"Choose a size of a similar shape, for instance {' '.join(map(str, own))}. (--size)"
-    crop = plan_crop(source, sampling.size or own, name=name, fix=fix)
+    size = _own_size(recording)
+    fix = f"Choose a size of a similar shape, for instance {' '.join(map(str, size))}. (--size)"
+    crop = plan_crop(source, sampling.size or size, name=name, fix=fix)
     left, top = (
         float((round(length * crop.scale) - kept) // 2)
         for length, kept in ((recording.width, crop.width), (recording.height, crop.height))

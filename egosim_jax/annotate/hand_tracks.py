@@ -11,9 +11,9 @@ from jaxtyping import Bool, UInt8
 
 from egosim_jax.annotate.config import Side
 from egosim_jax.annotate.prepare import RefusedError
+from egosim_jax.dynamics.hands import PALM
 from egosim_jax.io.bounded import unlike
-from egosim_jax.perception.estimates import LEFT, RIGHT, HandTracks
-from egosim_jax.perception.silhouettes import PALM
+from egosim_jax.perception.video.estimates import LEFT, RIGHT, HandTracks
 
 MAX_BOTH = 0.1
 """Maximum fraction of frames with two hands in a clip whose one hand has a given side."""
@@ -63,15 +63,15 @@ def drop_flashes(hands: HandTracks, fps: Fraction) -> HandTracks:
     with the other hand, it is a second detection of the other hand. So is one that is found for
     less than 1 s on the other hand.
     """
-    found = visible(hands)
+    seen = visible(hands)
     palms = hands.joints_px[:, :, PALM["human"]].mean(axis=2)
     sizes = np.ptp(hands.joints_px, axis=2).max(axis=(1, 2))
     apart = np.linalg.norm(palms[:, LEFT] - palms[:, RIGHT], axis=-1) / sizes
-    dropped = np.zeros_like(found)
+    dropped = np.zeros_like(seen)
     for side in (LEFT, RIGHT):
-        frames = np.flatnonzero(found[:, side])
+        frames = np.flatnonzero(seen[:, side])
         for run in np.split(frames, np.flatnonzero(np.diff(frames) > HOLD_S * fps) + 1):
-            if not len(run) or not found[run, 1 - side].all():
+            if not len(run) or not seen[run, 1 - side].all():
                 continue
             limit = OVER_S if np.median(apart[run]) <= OVER_SIZE else FLASH_S
             if len(run) < limit * fps:
@@ -85,20 +85,20 @@ def hold_hands(hands: HandTracks, fps: Fraction) -> HandTracks:
     In other frames, a lost hand keeps its nearest detection in time for 0.5 s. For silhouettes
     only: a hand that enters, leaves or is lost for a moment must not become part of the scene.
     """
-    from egosim_jax.perception.hands.track import fill_gaps, runs
+    from egosim_jax.perception.video.hands.track import fill_gaps, runs
 
     joints_px, joints_hand_m = hands.joints_px.copy(), hands.joints_hand_m.copy()
-    found, frames = visible(hands), np.arange(len(hands.presence))
-    gaps = np.zeros_like(found)
+    seen, frames = visible(hands), np.arange(len(hands.presence))
+    gaps = np.zeros_like(seen)
     for side in (LEFT, RIGHT):
-        known = np.flatnonzero(found[:, side])
-        if len(known):
-            nearest = known[np.abs(frames[:, None] - known).argmin(axis=1)]
+        frames_seen = np.flatnonzero(seen[:, side])
+        if len(frames_seen):
+            nearest = frames_seen[np.abs(frames[:, None] - frames_seen).argmin(axis=1)]
             near = np.abs(nearest - frames) <= HOLD_S * fps
             joints_px[near, side] = hands.joints_px[nearest[near], side]
             joints_hand_m[near, side] = hands.joints_hand_m[nearest[near], side]
-        for start, stop in runs(~found[:, side]):
-            within = start > 0 and stop < len(found)
+        for start, stop in runs(~seen[:, side]):
+            within = start > 0 and stop < len(seen)
             gaps[start:stop, side] = within and stop + 1 - start <= GAP_S * fps
     joints_px, joints_hand_m = (fill_gaps(joints, gaps) for joints in (joints_px, joints_hand_m))
     return replace(hands, joints_px=joints_px, joints_hand_m=joints_hand_m)
@@ -114,12 +114,12 @@ def before_entry(
     """
     import cv2
 
-    found, absent = visible(hands), np.zeros((len(frames), 2), bool)
+    seen, absent = visible(hands), np.zeros((len(frames), 2), bool)
     for side in (LEFT, RIGHT):
-        known = np.flatnonzero(found[:, side])
-        if not len(known) or known[0] == 0:
+        frames_seen = np.flatnonzero(seen[:, side])
+        if not len(frames_seen) or frames_seen[0] == 0:
             continue
-        at, inside = int(known[0]), np.zeros(frames.shape[1:3], np.uint8)
+        at, inside = int(frames_seen[0]), np.zeros(frames.shape[1:3], np.uint8)
         outline = cv2.convexHull(hands.joints_px[at, side].astype(np.int32))
         cv2.fillConvexPoly(inside, outline, 1)
         change = cv2.absdiff(frames[0], frames[at]).max(axis=-1)[inside > 0]
@@ -142,7 +142,7 @@ def on_side(hands: HandTracks, side: Side) -> HandTracks:
             "it. (--side)",
             {"both": share},
         )
-    own = LEFT if side == "left" else RIGHT
+    index = LEFT if side == "left" else RIGHT
     best = np.argmax(np.where(visible(hands), hands.presence, -1), axis=1)
     frames = np.arange(len(best))
     moved: dict[str, Any] = {"filled": None, "mirrored": None}
@@ -152,5 +152,5 @@ def on_side(hands: HandTracks, side: Side) -> HandTracks:
     ):  # fmt: skip
         if (values := getattr(hands, name)) is not None:
             moved[name] = np.full_like(values, missing)
-            moved[name][:, own] = values[frames, best]
+            moved[name][:, index] = values[frames, best]
     return HandTracks(**moved)

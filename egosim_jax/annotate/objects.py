@@ -21,13 +21,13 @@ def find_moved_objects(record: Record, estimators: Estimators, config: AnnotateC
 
     An object that a network segmented keeps its id. A sleeve counts as an arm.
     """
-    from egosim_jax.perception.moved import find_moved
+    from egosim_jax.perception.video.moved import find_moved
 
     ids, names = record.require("object_ids").copy(), dict(record.names or {})
-    found = []
+    objects = []
     if record.hands is not None and visible(record.hands).any():
         depth_m = record.require("depth").depth_m[0]
-        found = find_moved(
+        objects = find_moved(
             record.frames,
             record.moving,
             record.hands,
@@ -37,9 +37,9 @@ def find_moved_objects(record: Record, estimators: Estimators, config: AnnotateC
         )
     numbers: list[int] = []
     contacts: list[tuple[int, int, int]] = []
-    for moved in found:
-        known, count = np.unique(ids[0][moved.first], return_counts=True)
-        number = int(known[count.argmax()])
+    for moved in objects:
+        inside, count = np.unique(ids[0][moved.first], return_counts=True)
+        number = int(inside[count.argmax()])
         if moved.worn:
             number = -1
         elif number <= 0:
@@ -64,8 +64,8 @@ def measured(
     Completed depth has bumps on walls and at the image border that look like objects.
     """
     sizes = np.bincount(standing.ravel())
-    known = np.bincount(standing.ravel(), weights=confident.ravel(), minlength=len(sizes))
-    return np.where((2 * known >= sizes)[standing], standing, 0)
+    measured = np.bincount(standing.ravel(), weights=confident.ravel(), minlength=len(sizes))
+    return np.where((2 * measured >= sizes)[standing], standing, 0)
 
 
 def join_objects(
@@ -77,15 +77,15 @@ def join_objects(
     """
     joined, named = ids.copy(), dict(names)
     for number in range(1, int(standing.max()) + 1):
-        own = standing == number
-        if not own.any():
+        region = standing == number
+        if not region.any():
             continue
-        known = np.unique(ids[own & (ids > 0)], return_counts=True)
-        shared = int(known[1].max(initial=0))
-        if 2 * shared > own.sum():
-            new = int(known[0][known[1].argmax()])
+        numbers = np.unique(ids[region & (ids > 0)], return_counts=True)
+        shared = int(numbers[1].max(initial=0))
+        if 2 * shared > region.sum():
+            new = int(numbers[0][numbers[1].argmax()])
         else:
             new = max(int(joined.max()), *named, 0) + 1
             named[new] = object_name(new, {})
-        joined[own & (joined == 0)] = new
+        joined[region & (joined == 0)] = new
     return joined, named

@@ -242,12 +242,12 @@ def windows(
             refusal = "cut", reason
         return [_judge(name, scanned, 0, stop, rules, refusal)]
     check_length(length, cut=True)
-    found, length = [], length or count
+    windows, length = [], length or count
     for first, last in _shots(scanned, cuts):
         for start in range(first, last - length + 1, length):
             here = f"{name}_{start}_{start + length - 1}"
-            found.append(_judge(here, scanned, start, start + length, rules))
-    return found
+            windows.append(_judge(here, scanned, start, start + length, rules))
+    return windows
 
 
 def _shots(scanned: Scan, cuts: Sequence[int]) -> list[tuple[int, int]]:

@@ -23,7 +23,7 @@ from egosim_jax.data.recording import Recording
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.bounded import parse_json, quote_path, quote_text
 from egosim_jax.io.untrusted.npz import DAMAGE, array_names, read_arrays
-from egosim_jax.perception.estimates import (
+from egosim_jax.perception.video.estimates import (
     CameraEstimate,
     DepthEstimate,
     HandTracks,
@@ -113,8 +113,8 @@ class Record:
     @property
     def intrinsics(self) -> Float[np.ndarray, "3 3"] | None:
         """Intrinsics of the clip in pixels, if the recording has them."""
-        known = self.recording.intrinsics_px
-        return None if known is None else self.plan.intrinsics(known)
+        given = self.recording.intrinsics_px
+        return None if given is None else self.plan.intrinsics(given)
 
     @property
     def fps(self) -> Fraction:
@@ -149,7 +149,7 @@ def load(path: Path, record: Record, fields: Sequence[str], stage: str) -> Recor
     try:
         arrays = read_arrays(path, {}, others=array_names(path))
         about = parse_json(arrays.pop("about").tobytes(), source=quote_path(path))
-        found = {
+        arrays_of_stage = {
             name: _decode_runs(arrays) if name == _RUNS else _build(name, arrays, about)
             for name in fields
         }
@@ -157,7 +157,7 @@ def load(path: Path, record: Record, fields: Sequence[str], stage: str) -> Recor
         raise InputError(
             f"{quote_path(path)} is damaged: {quote_text(str(error))}. Remove it."
         ) from error
-    return record.add(stage, about["notes"], **found)
+    return record.add(stage, about["notes"], **arrays_of_stage)
 
 
 def _number(value: Any) -> Any:
@@ -172,8 +172,8 @@ def _flatten(name: str, value: Any, arrays: dict[str, np.ndarray], about: dict[s
         arrays[name] = value
     elif name in _CLASSES and value is not None:
         about[name] = {}
-        for part in dataclasses.fields(value):
-            _flatten(f"{name}.{part.name}", getattr(value, part.name), arrays, about)
+        for field in dataclasses.fields(value):
+            _flatten(f"{name}.{field.name}", getattr(value, field.name), arrays, about)
     elif isinstance(value, Mapping):
         about[name] = [[key, item] for key, item in value.items()]
     else:
@@ -186,8 +186,8 @@ def _build(name: str, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]
     value = about[name]
     if name in _CLASSES and value is not None:
         kind = _CLASSES[name]
-        parts = (part.name for part in dataclasses.fields(kind))
-        return kind(**{part: _build(f"{name}.{part}", arrays, about) for part in parts})
+        parts = (field.name for field in dataclasses.fields(kind))
+        return kind(**{field: _build(f"{name}.{field}", arrays, about) for field in parts})
     if isinstance(value, list):
         return {key: item for key, item in value}
     return value

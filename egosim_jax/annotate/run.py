@@ -9,12 +9,13 @@
     OUT/index.html           a page of all clips
 
 Files are written atomically and existing files are kept: the same command resumes after an
-interruption at any time. Unreadable videos are reported, and the other videos are annotated.
+interruption at any time, and other videos are added. Unreadable videos are reported, and the other
+videos are annotated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -55,6 +56,8 @@ class Scanned:
     """Clips that were refused before any stage, with rule and reason."""
     problem: str | None = None
     """Reason why the video has no clips, if so."""
+    note: str | None = None
+    """Part of the video that is annotated, unless it is all."""
 
 
 def require_config(out: Path, config: AnnotateConfig) -> None:
@@ -64,13 +67,13 @@ def require_config(out: Path, config: AnnotateConfig) -> None:
 
 
 def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    flat: dict[str, Any] = {}
     for name, item in value.items():
         if isinstance(item, Mapping):
-            found |= _flat(item, f"{prefix}{name}.")
+            flat |= _flat(item, f"{prefix}{name}.")
         elif name != "type":
-            found[f"{prefix}{name}"] = item
-    return found
+            flat[f"{prefix}{name}"] = item
+    return flat
 
 
 def scan_source(source: Source, out: Path, config: AnnotateConfig) -> Scanned:
@@ -80,7 +83,7 @@ def scan_source(source: Source, out: Path, config: AnnotateConfig) -> Scanned:
     Raises `InputError` if the video file differs from the scanned one.
     """
     path = out / WORK / "scans" / f"{source.name}.json"
-    size = 0 if source.path.is_dir() else source.path.stat().st_size
+    size = source.path.stat().st_size if source.path.is_file() else 0
     written = read_json(path) if path.exists() else None
     if written is not None and "problem" not in written:
         if written["path"] != str(source.path) or written["bytes"] != size:
@@ -88,15 +91,19 @@ def scan_source(source: Source, out: Path, config: AnnotateConfig) -> Scanned:
                 f"{source.path} is not the file that {out} was made from: {written['path']} of "
                 f"{written['bytes']:,} bytes. Choose another folder. (--out)"
             )
-        return _scanned(source.name, written)
+        return _scanned(source.name, out, written)
     about: dict[str, Any] = {"path": str(source.path), "bytes": size, "windows": []}
     try:
-        recording = open_source(source, config.depth_files)
+        recording = open_source(source, config.depth_files, config.depth_unit_m)
         fitted = plan(recording, config.sampling, cut=config.cutting.clips)
-        folder = out / WORK / "recordings" / source.name
-        recording.save(folder)
+        recording.save(_recording_folder(out, source.name))
         length = config.sampling.num_frames
-        about["recording"] = str(folder)
+        if length is not None and length < fitted.count and not config.cutting.clips:
+            about["note"] = (
+                f"of {fitted.count} frames at {float(fitted.fps):.4g} fps, the first {length} are "
+                "one clip, and the others are not used. Cut all into clips, or take more. "
+                "(--clips, --num-frames)"
+            )
         about["windows"] = [
             asdict(window)
             for window in windows(recording, scan(recording, fitted), length, config.cutting)
@@ -106,14 +113,19 @@ def scan_source(source: Source, out: Path, config: AnnotateConfig) -> Scanned:
     except InputError as error:
         about["problem"] = str(error)
     write_json(path, about)
-    return _scanned(source.name, about)
+    return _scanned(source.name, out, about)
 
 
-def _scanned(name: str, about: Mapping[str, Any]) -> Scanned:
+def _recording_folder(out: Path, name: str) -> Path:
+    """Return the folder of a video's recording; it is not stored, because `out` may be moved."""
+    return out / WORK / "recordings" / name
+
+
+def _scanned(name: str, out: Path, about: Mapping[str, Any]) -> Scanned:
     jobs, refused = [], []
     for window in about["windows"]:
         job = Job(
-            recording=about["recording"],
+            recording=str(_recording_folder(out, name)),
             **{key: window[key] for key in ("video_id", "start", "stop", "figures")},
         )
         if window["refused"]:
@@ -121,7 +133,7 @@ def _scanned(name: str, about: Mapping[str, Any]) -> Scanned:
             refused.append((job, rule, reason))
         else:
             jobs.append(job)
-    return Scanned(name, tuple(jobs), tuple(refused), about.get("problem"))
+    return Scanned(name, tuple(jobs), tuple(refused), about.get("problem"), about.get("note"))
 
 
 def scan_sources(
@@ -169,12 +181,12 @@ def choose_jobs(scanned: Iterable[Scanned], out: Path, config: AnnotateConfig) -
     """
     jobs: list[Job] = []
     seen: dict[str, str] = {}
-    for found in scanned:
-        for job, rule, reason in found.refused:
+    for video in scanned:
+        for job, rule, reason in video.refused:
             if not clip.read_annotation(job.video_id, out):
                 notes = {"rule": rule, "reason": reason, "figures": dict(job.figures)}
                 clip.finish(job, out, config, "refused", notes)
-        for job in found.jobs:
+        for job in video.jobs:
             if (other := seen.setdefault(job.video_id, job.recording)) != job.recording:
                 raise InputError(
                     f"Two recordings have the id {job.video_id}: {other} and {job.recording}. "
@@ -190,8 +202,8 @@ def choose_retries(scanned: Iterable[Scanned], out: Path) -> list[Job]:
     It is the median over the clips whose focal length was estimated.
     """
     retries = []
-    for found in scanned:
-        abouts = [clip.read_annotation(job.video_id, out) for job in found.jobs]
+    for video in scanned:
+        abouts = [clip.read_annotation(job.video_id, out) for job in video.jobs]
         focals = [
             about["cameras"]["focal_px"]
             for about in abouts
@@ -201,24 +213,28 @@ def choose_retries(scanned: Iterable[Scanned], out: Path) -> list[Job]:
             focal = float(np.median(focals))
             retries += [
                 replace(job, focal_px=focal)
-                for job, about in zip(found.jobs, abouts, strict=True)
+                for job, about in zip(video.jobs, abouts, strict=True)
                 if clip.can_retry(about)
             ]
     return retries
 
 
 def write_report(scanned: Sequence[Scanned], out: Path) -> dict[str, Any]:
-    """Write metadata.csv, report.json and index.html; return the report."""
+    """Write metadata.csv, report.json and index.html; return the report.
+
+    Videos that an earlier command annotated to the same folder are in them, too.
+    """
+    scanned = [*scanned, *_earlier({video.source for video in scanned}, out)]
     clips: list[dict[str, Any]] = []
     rows: list[dict[str, str]] = []
-    for found in scanned:
-        for job in (*found.jobs, *(job for job, _, _ in found.refused)):
+    for video in scanned:
+        for job in (*video.jobs, *(job for job, _, _ in video.refused)):
             about = read_json(out / job.video_id / ANNOTATION)
             if about["status"] == "done":
                 rows.append(about["row"])
-            clips.append({"source": found.source, **about})
+            clips.append({"source": video.source, **about})
     clips.sort(key=lambda about: (about["source"], about["start"]))
-    videos = {found.source: _summary(found, clips) for found in scanned}
+    videos = {video.source: _summary(video, clips) for video in scanned}
     counts = {
         status: sum(about["status"] == status for about in clips)
         for status in ("done", "refused", "failed")
@@ -233,10 +249,18 @@ def write_report(scanned: Sequence[Scanned], out: Path) -> dict[str, Any]:
     return report
 
 
-def _summary(found: Scanned, clips: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    own = [about for about in clips if about["source"] == found.source]
-    done = sum(about["status"] == "done" for about in own)
-    summary: dict[str, Any] = {"clips": len(own), "done": done}
-    if found.problem is not None:
-        summary["problem"] = found.problem
-    return summary
+def _earlier(names: Collection[str], out: Path) -> Iterator[Scanned]:
+    """Yield other videos that were scanned to a folder, with their finished clips."""
+    for path in sorted((out / WORK / "scans").glob("*.json")):
+        if path.stem not in names:
+            video = _scanned(path.stem, out, read_json(path))
+            done = [job for job in video.jobs if clip.read_annotation(job.video_id, out)]
+            yield replace(video, jobs=tuple(done))
+
+
+def _summary(video: Scanned, clips: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    annotated = [about for about in clips if about["source"] == video.source]
+    done = sum(about["status"] == "done" for about in annotated)
+    summary: dict[str, Any] = {"clips": len(annotated), "done": done}
+    texts = {"problem": video.problem, "note": video.note}
+    return summary | {name: text for name, text in texts.items() if text is not None}

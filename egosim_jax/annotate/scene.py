@@ -24,15 +24,17 @@ from egosim_jax.annotate.stages import (
     joints_in_world,
     undistort_clip,
 )
+from egosim_jax.data.clip_files import prior_column
+from egosim_jax.dynamics import predict
 from egosim_jax.evaluation.metrics.image import decibels
 from egosim_jax.geometry import invert, pixel_rays, pixels_of, transform
 from egosim_jax.io.bounded import unlike
-from egosim_jax.perception.estimates import DepthEstimate, Rung
+from egosim_jax.perception.video.estimates import DepthEstimate, Rung
 from egosim_jax.rendering import POINT_PX
 from egosim_jax.rendering.reference import splat
 from egosim_jax.state.depth import state_from_depth
 from egosim_jax.state.instances import find_objects
-from egosim_jax.types import SceneState, Triplet
+from egosim_jax.types import Action, Motion, SceneState, Triplet
 
 MIN_FIXED_DB = 16.0
 """Minimum PSNR of the background if the camera stays in its place, in decibels."""
@@ -44,7 +46,7 @@ FRAMES_AT_ONCE = 64
 
 def find_scale(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
     """Convert cameras, depth and joints to meters; note the scale, its source and uncertainty."""
-    from egosim_jax.perception.scale import Scale, estimate_scale, scale_cameras, scale_depth
+    from egosim_jax.perception.video.scale import Scale, estimate_scale, scale_cameras, scale_depth
 
     estimate, depth = record.require("estimate"), record.require("depth")
     joints = None if record.hands is None else _lifted(record)
@@ -76,7 +78,7 @@ def find_scale(record: Record, estimators: Estimators, config: AnnotateConfig) -
 
 def _lifted(record: Record) -> Float[np.ndarray, "f 2 21 3"]:
     """Return the hands in meters, in the camera of each frame."""
-    from egosim_jax.perception.hands import lift, steady
+    from egosim_jax.perception.video.hands import lift, steady
 
     return steady(lift(record.require("hands"), record.cameras.intrinsics_px), record.fps)
 
@@ -87,7 +89,7 @@ def refine_scale(record: Record, estimators: Estimators, config: AnnotateConfig)
     This replaces a scale from hands that may have touched the scene at any time. An assumed plane
     moves behind these objects.
     """
-    from egosim_jax.perception.scale import contact_scale, scale_cameras
+    from egosim_jax.perception.video.scale import contact_scale, scale_cameras
 
     record = replace(record, depth=plane_behind_objects(record))
     contacts, joints_m = record.require("contacts"), record.joints_m
@@ -111,15 +113,15 @@ def refine_scale(record: Record, estimators: Estimators, config: AnnotateConfig)
 
 def plane_behind_objects(record: Record) -> DepthEstimate:
     """Return the depth with an assumed plane moved behind the moved objects, by their width."""
-    depth, own = record.require("depth"), record.moved[0]
-    if depth.confident.any() or not own.any():
+    depth, pixels = record.require("depth"), record.moved[0]
+    if depth.confident.any() or not pixels.any():
         return depth
     numbers = record.require("moved_ids")
     ids = record.require("object_ids")[0]
     sides = [np.ptp(np.argwhere(ids == n), axis=0).min() + 1 for n in numbers if (ids == n).any()]
     factor = 1 + max(sides) / record.cameras.intrinsics_px[0, 0]
     depth_m = depth.depth_m * np.float32(factor)
-    depth_m[0][own] = depth.depth_m[0][own]
+    depth_m[0][pixels] = depth.depth_m[0][pixels]
     return replace(depth, depth_m=depth_m)
 
 
@@ -127,8 +129,10 @@ def _sparse_depth(record: Record) -> DepthEstimate:
     """Return the triangulated points as sparse depth of the first frame, in camera units."""
     estimate = record.require("estimate")
     points, cameras = estimate.points, estimate.cameras
-    own = points.frames == 0
-    local = transform(invert(cameras.world_from_camera[0]), points.points_m[points.indices[own]])
+    in_first = points.frames == 0
+    local = transform(
+        invert(cameras.world_from_camera[0]), points.points_m[points.indices[in_first]]
+    )
     row, column, inside = pixels_of(cameras, local)
     sparse = np.full((1, cameras.height, cameras.width), np.inf, np.float32)
     sparse[0, row[inside], column[inside]] = local[inside, 2]
@@ -139,7 +143,7 @@ def _sparse_depth(record: Record) -> DepthEstimate:
 
 def clean_first_frame(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
     """Add `first_frame`: hands and arms are replaced from other frames, or inpainted."""
-    from egosim_jax.perception.plate import clean_plate
+    from egosim_jax.perception.video.plate import clean_plate
 
     depth_m = record.require("depth").depth_m[0]
     margin = max(2, round(PLATE_MARGIN * record.plan.width))
@@ -157,7 +161,7 @@ def clean_first_frame(record: Record, estimators: Estimators, config: AnnotateCo
 
 def build_state(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
     """Add `state`, the scene of the prior, from the first frame or also from key frames."""
-    from egosim_jax.perception.depth import points_per_pixel
+    from egosim_jax.perception.video.depth import points_per_pixel
 
     cameras, depth = record.cameras, record.require("depth")
     ids, names = np.maximum(record.require("object_ids")[0], 0), dict(record.names or {})
@@ -239,6 +243,7 @@ def to_triplet(record: Record, config: AnnotateConfig) -> tuple[Triplet, dict[st
             "split": config.split,
             "source": record.recording.video.name,
             "rung": record.require("estimate").verdict.rung,
+            **prior_column(config.prior),
         },
     )
     # Not the mask: its observed region is wider than the points.
@@ -268,18 +273,31 @@ def _render(
     renderer, cameras = rendering.get(config.renderer), record.cameras
     state, joints_m = record.require("state"), record.require("joints_m")
     last = len(record.frames) - 1
+    motion = _motion(record) if config.prior == "predicted" else None
     pieces = []
     for start in range(0, last + 1, FRAMES_AT_ONCE):
         # Padding the last chunk keeps one shape, and so one compiled program.
         here = np.minimum(np.arange(start, start + min(FRAMES_AT_ONCE, last + 1)), last)
         some = replace(cameras, world_from_camera=cameras.world_from_camera[here])
-        view = renderer.render(state, some, point_px=POINT_PX)
+        moving = None if motion is None else motion.at(here)
+        view = renderer.render(state, some, point_px=POINT_PX, motion=moving)
         hands, _ = renderer.draw_hands(joints_m[here], some, kind=record.recording.kind)
         pieces.append((view.frames, view.mask, hands, np.isfinite(view.depth_m)))
     prior, mask, hands, drawn = (
-        np.concatenate(part)[: last + 1] for part in zip(*pieces, strict=True)
+        np.concatenate(piece)[: last + 1] for piece in zip(*pieces, strict=True)
     )
     return prior, mask, hands, drawn
+
+
+def _motion(record: Record) -> Motion:
+    """Predict how the recorded hands move the objects of the state."""
+    action = Action(
+        cameras=record.cameras,
+        joints_m=record.require("joints_m"),
+        kind=record.recording.kind,
+        prompt=record.require("prompt"),
+    )
+    return predict(record.require("state"), action, fps=round(record.fps) or 1)
 
 
 def _psnr(

@@ -35,7 +35,7 @@ from egosim_jax.annotate.prepare import RefusedError
 from egosim_jax.annotate.record import Record
 from egosim_jax.geometry import invert, project, transform
 from egosim_jax.io.bounded import unlike
-from egosim_jax.perception.estimates import (
+from egosim_jax.perception.video.estimates import (
     CameraEstimate,
     DepthEstimate,
     HandTracks,
@@ -107,11 +107,11 @@ def search_hands(record: Record, estimators: Estimators) -> HandTracks:
     frames = read_searched_frames(record.recording, record.source_frames, record.plan)
     if frames is None:
         return estimators.hands(record.frames)
-    found = estimators.hands(frames)
-    joints_px = record.plan.pixels(found.joints_px, (frames.shape[1], frames.shape[2]))
+    tracks = estimators.hands(frames)
+    joints_px = record.plan.pixels(tracks.joints_px, (frames.shape[1], frames.shape[2]))
     last = np.array([record.plan.width, record.plan.height]) - 0.5
     inside = ((joints_px >= -0.5) & (joints_px <= last)).all(axis=-1).mean(axis=-1) >= 0.5
-    return without(replace(found, joints_px=joints_px), visible(found) & ~inside)
+    return without(replace(tracks, joints_px=joints_px), visible(tracks) & ~inside)
 
 
 def _check_sides(hands: HandTracks, seen: np.ndarray, config: AnnotateConfig) -> None:
@@ -150,13 +150,13 @@ def draw_silhouettes(record: Record, estimators: Estimators, config: AnnotateCon
             names={number: name for number, name in names.items() if number > 0},
         )
     if record.hands is None:
-        from egosim_jax.perception.silhouettes import HandShape, hand_silhouette
+        from egosim_jax.perception.video.silhouettes import HandShape, hand_silhouette
 
         kind, cameras = record.recording.kind, _cameras_of_given_hands(record)
         joints = np.asarray(record.recording.joints_m)[record.source_frames]
         moving = hand_silhouette(joints, kind, cameras, HandShape()) >= 0
     else:
-        from egosim_jax.perception.silhouettes import track_silhouettes
+        from egosim_jax.perception.video.silhouettes import track_silhouettes
 
         held = hold_hands(record.hands, record.fps)
         absent = before_entry(record.hands, record.frames)
@@ -167,8 +167,8 @@ def draw_silhouettes(record: Record, estimators: Estimators, config: AnnotateCon
 
 def find_cameras(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
     """Add `estimate`: recorded or estimated cameras. Raises `RefusedError` without cameras."""
-    from egosim_jax.perception.cameras import CameraLadder
-    from egosim_jax.perception.depth.triangulate import triangulate_frames
+    from egosim_jax.perception.video.cameras import CameraLadder
+    from egosim_jax.perception.video.depth.triangulate import triangulate_frames
 
     given = _given_cameras(record)
     if given is not None:
@@ -201,7 +201,7 @@ def find_cameras(record: Record, estimators: Estimators, config: AnnotateConfig)
 
 def undistort_clip(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
     """Undistort frames, hands and silhouettes if the lens is not a pinhole."""
-    from egosim_jax.perception.cameras import undistort, undistort_pixels
+    from egosim_jax.perception.video.cameras import undistort, undistort_pixels
 
     estimate, hands = record.require("estimate"), record.hands
     if estimate.lens is None:
@@ -223,11 +223,12 @@ def find_depth(record: Record, estimators: Estimators, config: AnnotateConfig) -
     wanted = depth_frames(record, config)
     maps = [_given_depth(record, frame) for frame in wanted]
     if all(depth is not None for depth in maps):
-        known = np.stack([depth for depth in maps if depth is not None])
+        _check_unit(record)
+        measured = np.stack([depth for depth in maps if depth is not None])
         depth = DepthEstimate(
             frames=np.array(wanted, np.int32),
-            depth_m=known,
-            confident=np.isfinite(known),
+            depth_m=measured,
+            confident=np.isfinite(measured),
             metric=True,
         )
         return record.add("depth", {"source": "recording"}, depth=depth)
@@ -235,6 +236,24 @@ def find_depth(record: Record, estimators: Estimators, config: AnnotateConfig) -
     confident = float(depth.confident.mean())
     notes = {"source": config.depth, "reason": depth.reason, "confident": confident}
     return record.add("depth", notes, depth=depth)
+
+
+def _check_unit(record: Record) -> None:
+    """Raise `RefusedError` if recorded depth contradicts the distance of the hands."""
+    from egosim_jax.perception.video.scale import check_depth_unit
+
+    joints = _joints_in_cameras(record)
+    shown = np.flatnonzero(np.any(np.isfinite(joints).all(axis=(2, 3)), axis=1))
+    frames = shown[np.unique(np.linspace(0, len(shown) - 1, KEY_FRAMES).astype(int))]
+    maps = {frame: _given_depth(record, frame) for frame in frames.tolist()} if len(shown) else {}
+    measured = {frame: depth for frame, depth in maps.items() if depth is not None}
+    try:
+        if measured:
+            check_depth_unit(record.cameras, np.stack([*measured.values()]), joints[[*measured]])
+    except InputError as error:
+        raise RefusedError(
+            "depth", f"depth: {error} Give the length of a unit in meters. (--depth-unit)"
+        ) from error
 
 
 def depth_frames(record: Record, config: AnnotateConfig) -> list[int]:
@@ -246,11 +265,11 @@ def depth_frames(record: Record, config: AnnotateConfig) -> list[int]:
 
 def _given_cameras(record: Record) -> Cameras | None:
     """Return the recording's cameras at the clip's frame rate and size, if it has any."""
-    known, intrinsics = record.recording.world_from_camera, record.intrinsics
-    if known is None or intrinsics is None:
+    given, intrinsics = record.recording.world_from_camera, record.intrinsics
+    if given is None or intrinsics is None:
         return None
     return Cameras(
-        world_from_camera=np.asarray(known, float)[record.source_frames],
+        world_from_camera=np.asarray(given, float)[record.source_frames],
         intrinsics_px=intrinsics,
         height=record.plan.height,
         width=record.plan.width,
@@ -301,12 +320,12 @@ def _project_given(record: Record, joints_m: np.ndarray) -> HandTracks:
     pixels = np.stack(project(cameras.intrinsics_px, local), axis=-1)
     behind = (local[..., 2] <= 0).any(axis=-1)
     local[behind], pixels[behind] = np.nan, np.nan
-    found = np.isfinite(local).all(axis=(2, 3))
+    visible_hands = np.isfinite(local).all(axis=(2, 3))
     padding = ((0, 0), (0, 2 - joints.shape[1]), (0, 0), (0, 0))
     return HandTracks(
         joints_px=np.pad(pixels, padding, constant_values=np.nan),
         joints_hand_m=np.pad(local, padding, constant_values=np.nan),
-        presence=np.pad(found.astype(float), padding[:2]),
+        presence=np.pad(visible_hands.astype(float), padding[:2]),
     )
 
 
@@ -324,12 +343,19 @@ def _camera_notes(estimate: CameraEstimate, focal_source: str) -> dict[str, Any]
 
 def joints_in_world(record: Record) -> np.ndarray:
     """Return the world joints in meters: recorded, or lifted from pixels."""
-    from egosim_jax.perception.hands import lift, steady
-
     given = record.recording.joints_m
     if given is not None:
         return given[record.source_frames].astype(float)
-    cameras = record.cameras
-    local = steady(lift(record.require("hands"), cameras.intrinsics_px), record.fps)
-    poses = rearrange(cameras.world_from_camera, "f a b -> f 1 a b")
-    return transform(poses, local)
+    poses = rearrange(record.cameras.world_from_camera, "f a b -> f 1 a b")
+    return transform(poses, _joints_in_cameras(record))
+
+
+def _joints_in_cameras(record: Record) -> np.ndarray:
+    """Return the joints in meters in the camera of each frame: recorded, or lifted from pixels."""
+    from egosim_jax.perception.video.hands import lift, steady
+
+    given, cameras = record.recording.joints_m, record.cameras
+    if given is not None:
+        poses = rearrange(invert(cameras.world_from_camera), "f a b -> f 1 a b")
+        return transform(poses, given[record.source_frames].astype(float))
+    return steady(lift(record.require("hands"), cameras.intrinsics_px), record.fps)

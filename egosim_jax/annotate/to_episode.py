@@ -30,11 +30,11 @@ def episode_from(folder: Path, video: VideoSpec, *, clips: int | None = None) ->
     """
     if not (folder / ANNOTATION).exists() and folder.parent.is_dir():
         places = folder.glob(f"*/{ANNOTATION}"), folder.parent.glob(f"*/{ANNOTATION}")
-        known = sorted(str(path.parent) for found in places for path in found)
-        if known:
+        folders = sorted(str(path.parent) for paths in places for path in paths)
+        if folders:
             raise InputError(
                 f"{quote_path(folder)} is no clip of `egosim data annotate`. There are "
-                f"{listing(known)}."
+                f"{listing(folders)}."
             )
     about = read_json(folder / ANNOTATION)
     row = about.get("row") if isinstance(about, dict) else None
@@ -99,9 +99,9 @@ def _caption(about: Mapping[str, Any], prompt: str, joints_m: np.ndarray, kind: 
     if not isinstance(made, dict) or made.get("source") != RULE:
         return prompt
     names = made.get("names")
-    known = [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
+    texts = [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
     seen = np.asarray(np.isfinite(joints_m).all(axis=(2, 3)).any(axis=0)).tolist()
-    return caption_by_rule(seen, known, kind)
+    return caption_by_rule(seen, texts, kind)
 
 
 def _reachable(joints_m: np.ndarray) -> np.ndarray:

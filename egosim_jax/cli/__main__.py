@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from egosim_jax.runtime import interrupts
+from egosim_jax.runtime import interrupts, preemption
 
 interrupts.expect()  # before the slow imports, during which Ctrl-C may already come
 
@@ -37,6 +37,8 @@ egosim --help describes all commands, egosim COMMAND --help one with its options
 
 ANNOUNCED = ("simulate", "generate", "evaluate", "play", "serve", "train", "data annotate")
 """Commands that load for seconds, and so print a line before the first import."""
+RESUBMITTED = ("train", "data encode")
+"""Commands that SIGTERM ends with the exit code 75, at any time."""
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -47,7 +49,9 @@ def main(args: Sequence[str] | None = None) -> int:
         return 0
     program = f"egosim {given[0]}"
     module = PROGRAMS.get(given[0], "egosim_jax.cli.commands")
-    words = next((known for known in ANNOUNCED if known.split() == given[: len(known.split())]), "")
+    if args is None and _named(given, RESUBMITTED):
+        preemption.expect()
+    words = _named(given, ANNOUNCED)
     loaded = _load(module, f"egosim {words or given[0]}", announced=bool(words), options=given)
     if given[0] not in PROGRAMS:
         return loaded.run(args, programs=PROGRAMS)
@@ -60,8 +64,14 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def train() -> int:
     """Run the program `egosim-train`; return its exit code."""
+    preemption.expect()
     loaded = _load(PROGRAMS["train"], "egosim-train", announced=True, options=sys.argv)
     return loaded.main()
+
+
+def _named(given: Sequence[str], commands: Sequence[str]) -> str:
+    """Return which of the commands a command line names; empty if none."""
+    return next((name for name in commands if name.split() == given[: len(name.split())]), "")
 
 
 def _load(module: str, program: str, *, announced: bool, options: Sequence[str]) -> Any:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import tyro
 
 from egosim_jax.io.bounded import listing
-from egosim_jax.perception.estimates import ChosenRung
-from egosim_jax.rendering import RendererName
+from egosim_jax.perception.video.estimates import ChosenRung
+from egosim_jax.rendering import PriorKind, RendererName
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.runtime.progress import track
 from egosim_jax.runtime.terminal import counted, printable
@@ -43,7 +43,7 @@ class Annotate:
         ),
         "hands and masks": ("hand_weights", "side", "masks", "detector", "phrases"),
         "cameras and scene": (
-            "focal", "rung", "scale", "camera_height", "state", "renderer",
+            "focal", "rung", "depth_unit", "scale", "camera_height", "state", "renderer", "prior",
         ),
         "run": (
             "device", "dtype", "offline", "workers", "ray", "ray_gpus", "ray_actors", "seed",
@@ -103,6 +103,8 @@ class Annotate:
     """Depth: sweep, depth-anything=FOLDER, depth-pro=FOLDER, depth-anything-3=FOLDER, files=FOLDER.
 
     files: one FOLDER/ID/000000.png (16 bits, millimeters) or .npy (meters) per frame."""
+    depth_unit: float | None = None
+    """Length in meters of a unit of depth files and of recorded depth, such as 0.0001."""
     scale: float | None = None
     """Meters per unit of the cameras, instead of an estimate from the hands."""
     camera_height: float | None = None
@@ -113,6 +115,10 @@ class Annotate:
     """Caption of all clips, or qwen=FOLDER to caption each clip by Qwen."""
     renderer: RendererName = "jax"
     """Renderer of prior and hands."""
+    prior: PriorKind | None = None
+    """Places of the objects in the prior; by default as the model of --config has them.
+
+    static: as in the first frame; predicted: where the hands move them."""
     split: str = "train"
     """Value of the column `split` in metadata.csv, for all clips."""
     workers: int = 1
@@ -169,6 +175,8 @@ class Annotate:
         for name, video in report["videos"].items():
             if "problem" in video:
                 print(printable(f"{name}: no clip: {video['problem']}"), file=sys.stderr)
+            if "note" in video:
+                print(printable(f"{name}: {video['note']}"), file=sys.stderr)
         reasons: dict[str, list[str]] = {}
         for about in report["annotations"]:
             if about.get("reason"):
@@ -176,7 +184,7 @@ class Annotate:
         for reason, names in reasons.items():
             print(printable(f"{listing(names)}: no annotation: {reason}"), file=sys.stderr)
         cameras = [about["cameras"] for about in report["annotations"] if about.get("cameras")]
-        assumed = [found for found in cameras if found["focal_source"] == "assumed"]
+        assumed = [camera for camera in cameras if camera["focal_source"] == "assumed"]
         if assumed:
             print(
                 f"{counted(len(assumed), 'clip')} without a known focal length: a view of 90 "
@@ -195,11 +203,12 @@ class Annotate:
         from egosim_jax.annotate.frames import Sampling
         from egosim_jax.annotate.prepare import Cutting, Quality
 
-        size, fps, count = self.size, self.fps, self.num_frames
+        size, fps, count, prior = self.size, self.fps, self.num_frames, self.prior or "static"
         if self.config is not None:
             from egosim_jax import configs
 
-            video = configs.get(self.config).video
+            model = configs.get(self.config)
+            video, prior = model.video, self.prior or model.prior
             size = size or (video.height, video.width)
             fps, count = fps or float(video.fps), count or video.frames
         quality = Quality(
@@ -225,11 +234,13 @@ class Annotate:
             focal_px=self.focal,
             rung=self.rung,
             depth=self.depth,
+            depth_unit_m=self.depth_unit,
             scale=self.scale,
             camera_height_m=self.camera_height,
             state=self.state,
             caption=self.caption,
             renderer=self.renderer,
+            prior=prior,
             split=self.split,
             seed=self.seed,
         )

@@ -5,12 +5,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import make_dataclass
-from functools import reduce
 from importlib import import_module
-from operator import or_
-from typing import Annotated, Any
-
-import tyro
+from typing import Any
 
 from egosim_jax.cli.data import Data
 from egosim_jax.cli.doctor import Doctor
@@ -29,22 +25,24 @@ from egosim_jax.cli.table import TableCommand
 from egosim_jax.cli.view import View
 from egosim_jax.runtime import command
 
-Commands = (
-    Annotated[Generate, tyro.conf.subcommand("generate")]
-    | Annotated[Preflight, tyro.conf.subcommand("preflight")]
-    | Annotated[Simulate, tyro.conf.subcommand("simulate")]
-    | Annotated[Episode, tyro.conf.subcommand("episode")]
-    | Annotated[Play, tyro.conf.subcommand("play")]
-    | Annotated[Serve, tyro.conf.subcommand("serve")]
-    | Annotated[View, tyro.conf.subcommand("view")]
-    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    | Annotated[TableCommand, tyro.conf.subcommand("table")]
-    | Annotated[Rank, tyro.conf.subcommand("rank")]
-    | Annotated[Data, tyro.conf.subcommand("data")]
-    | Annotated[Robot, tyro.conf.subcommand("robot")]
-    | Annotated[Models, tyro.conf.subcommand("models")]
-    | Annotated[Experiment, tyro.conf.subcommand("experiment")]
-    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
+Commands = command.subcommands(
+    {
+        "generate": Generate,
+        "preflight": Preflight,
+        "simulate": Simulate,
+        "episode": Episode,
+        "play": Play,
+        "serve": Serve,
+        "view": View,
+        "evaluate": Evaluate,
+        "table": TableCommand,
+        "rank": Rank,
+        "data": Data,
+        "robot": Robot,
+        "models": Models,
+        "experiment": Experiment,
+        "doctor": Doctor,
+    }
 )
 
 
@@ -67,8 +65,8 @@ def run(args: Sequence[str] | None, *, programs: Mapping[str, str]) -> int:
 
 def _with_programs(programs: Mapping[str, str]) -> Any:
     """Return all commands and the programs of some modules, for the shell completion of tyro."""
-    found: list[Any] = [Commands]
-    for name, module in programs.items():
-        kind = make_dataclass(name, [("command", import_module(module).Commands)])
-        found.append(Annotated[kind, tyro.conf.subcommand(name)])
-    return reduce(or_, found)
+    kinds = {
+        name: make_dataclass(name, [("command", import_module(module).Commands)])
+        for name, module in programs.items()
+    }
+    return Commands | command.subcommands(kinds)

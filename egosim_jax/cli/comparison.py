@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from egosim_jax.evaluation.methods import Folder, Method
     from egosim_jax.evaluation.result import Evaluation
     from egosim_jax.evaluation.scoring import Protocol
-    from egosim_jax.perception.estimates import DepthEstimator
+    from egosim_jax.perception.video.estimates import DepthEstimator
 
 Baseline = Literal["prior", "prior_fit", "still"]
 Network = Literal["alex", "vgg"]
@@ -27,7 +27,17 @@ class Options:
     """Clips, baselines and measures of a comparison."""
 
     help_groups: ClassVar[HelpGroups] = {
-        "measures": ("lpips", "dreamsim", "regions", "hands", "cameras", "depth", "fvd", "device"),
+        "measures": (
+            "lpips",
+            "dreamsim",
+            "regions",
+            "hands",
+            "cameras",
+            "depth",
+            "fvd",
+            "metrics",
+            "device",
+        ),
         "page": ("baselines", "page_clips"),
     }
     metadata: Path
@@ -56,6 +66,8 @@ class Options:
     """Folder of Depth Anything V2 (metric) or 3: also the depth error (extra `networks`)."""
     fvd: Path | None = None
     """Folder of a VideoMAE: also the Fréchet video distance (extra `networks`)."""
+    metrics: tuple[str, ...] = ()
+    """Your own metrics, each as MODULE:NAME or an entry point of egosim_jax.metrics."""
     device: str = "auto"
     """Device of the networks: cpu, cuda, cuda:N, or auto for the first GPU if there is one."""
     page_clips: int = 8
@@ -77,43 +89,49 @@ class Options:
 
     def measures(self, networks: Sequence[Network]) -> tuple[list[Measure], list[str]]:
         """Return the available measures, and the reason for each unavailable one."""
-        from egosim_jax.evaluation.measures import DreamSimDistance, LpipsDistance, Pixels
+        from egosim_jax.evaluation.measures import (
+            METRICS,
+            dreamsim_distance,
+            lpips_distance,
+            pixels,
+        )
         from egosim_jax.evaluation.metrics import lpips
         from egosim_jax.evaluation.metrics.dreamsim import DreamSim
 
-        measures: list[Measure] = [Pixels()]
+        measures: list[Measure] = [pixels()]
         unavailable: list[str] = []
         for name in networks:
             network = lpips.load_if_installed(name)
             if network is None:
                 unavailable.append(f"lpips_{name}: {lpips.MISSING}")
             else:
-                measures.append(LpipsDistance(network, name))
+                measures.append(lpips_distance(network, name))
         if self.dreamsim is not None:
-            measures.append(DreamSimDistance(DreamSim(self.dreamsim)))
-        return [*measures, *self._estimated()], unavailable
+            measures.append(dreamsim_distance(DreamSim(self.dreamsim)))
+        added = [METRICS.parse(name) for name in self.metrics]
+        return [*measures, *self._estimated(), *added], unavailable
 
     def _estimated(self) -> Iterator[Measure]:
         """Yield the measures that need estimates or networks."""
         from egosim_jax.evaluation import estimated
 
         if self.regions:
-            yield estimated.Regions()
+            yield estimated.regions()
         if self.hands:
-            from egosim_jax.perception.hands import LandmarkHands
+            from egosim_jax.perception.video.hands import LandmarkHands
 
-            yield estimated.HandScores(LandmarkHands())
+            yield estimated.hands(LandmarkHands())
         if self.cameras:
-            from egosim_jax.perception.cameras import CameraLadder
+            from egosim_jax.perception.video.cameras import CameraLadder
 
-            yield estimated.CameraError(CameraLadder())
+            yield estimated.cameras(CameraLadder())
         if self.depth is not None:
-            yield estimated.DepthError(self._depth_network(self.depth))
+            yield estimated.depth(self._depth_network(self.depth))
         if self.fvd is not None:
-            from egosim_jax.evaluation.fvd import Features
+            from egosim_jax.evaluation.fvd import features
             from egosim_jax.perception.networks import VideoMae
 
-            yield Features(VideoMae(self.fvd, device=self.device))
+            yield features(VideoMae(self.fvd, device=self.device))
 
     def _depth_network(self, folder: Path) -> DepthEstimator:
         from egosim_jax.io.bounded import read_json
@@ -137,11 +155,9 @@ class Options:
     ) -> Evaluation:
         """Compare the clips, print the table and write its files to a folder."""
         from egosim_jax.evaluation import pages
-        from egosim_jax.evaluation.cache import CACHE, ScoreCache
-        from egosim_jax.evaluation.files import draw, write_files
+        from egosim_jax.evaluation.evaluate import compare
+        from egosim_jax.evaluation.files import draw
         from egosim_jax.evaluation.metrics.dreamsim import MISSING
-        from egosim_jax.evaluation.result import Evaluation
-        from egosim_jax.evaluation.scoring import Scoring
 
         if self.page_clips < 0:
             raise InputError(
@@ -149,13 +165,6 @@ class Options:
             )
         methods = self.methods(folders)
         measures, unavailable = self.measures(networks)
-        scoring = Scoring(
-            methods=methods,
-            measures=measures,
-            protocol=protocol,
-            cache=ScoreCache(out / CACHE),
-        )
-        rows = scoring.run(clips)
         extra = [key for m in measures[1:] for key in m.columns if key not in result["shown"]]
         if "dreamsim" in result["shown"] and self.dreamsim is None:
             unavailable.append(f"dreamsim: {MISSING}")
@@ -163,8 +172,9 @@ class Options:
         paged = self.page_clips > 0 and pages.can_be_written()
         if self.page_clips and not paged:
             unavailable.append(f"{pages.PAGE}: {pages.MISSING}")
-        evaluation = Evaluation.of(scoring, rows, unavailable=unavailable, **result)
-        write_files(evaluation, out)
+        evaluation = compare(
+            methods, clips, measures, protocol=protocol, out=out, unavailable=unavailable, **result
+        )
         if self.page_clips:
             draw(evaluation, out / "scores.png")
         if paged:

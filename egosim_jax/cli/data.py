@@ -13,9 +13,9 @@ import tyro
 from egosim_jax.cli.annotate import Annotate
 from egosim_jax.cli.export import Export
 from egosim_jax.cli.imports import Import
-from egosim_jax.cli.triplets import Align, FromCaches, Mix, Static, ToDwm
-from egosim_jax.data.clip_files import Prompts
-from egosim_jax.runtime.command import ExitCode, Writes
+from egosim_jax.cli.triplets import Align, Mix, Static, ToDwm
+from egosim_jax.data.clip_files import ClipFiles, Prompts
+from egosim_jax.runtime.command import ExitCode, Writes, group
 from egosim_jax.runtime.progress import track
 from egosim_jax.runtime.terminal import make_console, printable
 from egosim_jax.types import WAN_GRID, InputError, VideoGrid, VideoSpec, check_counts
@@ -59,14 +59,17 @@ class Pack:
     Use it for small models, whose training step is shorter than decoding."""
     num_frames: int = 61
     """With --size, number of frames to store of each clip."""
-    resampling: Literal["first", "stride", "linspace", "rate"] = "first"
+    resampling: Literal["first", "stride", "linspace", "rate", "step"] = "first"
     """With --size, frames to take.
 
     first: the first frames, without gaps; stride: at the largest even spacing, as DWM's loader;
-    linspace: from the first to the last, as DWM's encoder; rate: at about --fps, as DWM's
-    evaluation."""
-    fps: int = 8
-    """With --resampling rate, frame rate of the model."""
+    linspace: from the first to the last, as DWM's encoder; rate: the nearest in time at the model's
+    rate; step: every n-th, with the clip's rate over the model's rounded down, as DWM's evaluation.
+    The first frames must have the model's rate."""
+    fps: int | None = None
+    """Frame rate of the model; by default the one of --config.
+
+    Without both, 8 with --resampling rate or step, and else any."""
     shard_megabytes: int = 256
     """Maximum size of a shard file in MiB."""
     overwrite: bool = False
@@ -78,14 +81,16 @@ class Pack:
 
     def run(self) -> int:
         """Check and pack each clip."""
+        from egosim_jax import configs
         from egosim_jax.data.metadata import read_metadata, select
         from egosim_jax.data.pack import pack
         from egosim_jax.io.digest import sha256
 
-        check_counts({"--shard-megabytes": self.shard_megabytes})
-        spec = self._spec()
+        check_counts({"--shard-megabytes": self.shard_megabytes, "--fps": self.fps})
         clips = read_metadata(self.metadata, prompts=self.prompts)
         items = select(clips, where=self.where, limit=self.limit)
+        fps = self.fps or (None if self.config is None else configs.get(self.config).video.fps)
+        spec = self._spec(fps, items[0])
         progress = pack(
             items,
             out=self.out,
@@ -96,6 +101,7 @@ class Pack:
             decoding=self.decoding,
             grid=_grid(self.config),
             resampling=self.resampling,
+            fps=fps,
         )
         skipped = 0
         for problem in filter(None, track(progress, "packing", total=len(items))):
@@ -105,15 +111,20 @@ class Pack:
         print(self.out)
         return ExitCode.PARTIAL if skipped else ExitCode.DONE
 
-    def _spec(self) -> VideoSpec | None:
-        if self.resampling != "rate":
-            self._refuse("fps", without="--resampling rate")
+    def _spec(self, fps: int | None, first: ClipFiles) -> VideoSpec | None:
+        """Return length, size and rate of frames to store; None for source files."""
         if self.size is None:
             self._refuse("num_frames", without="--size")
             self._refuse("decoding", without="--size")
             return None
-        rate = {"fps": self.fps} if self.resampling == "rate" else {}
-        spec = VideoSpec(frames=self.num_frames, height=self.size[0], width=self.size[1], **rate)
+        if self.resampling in ("stride", "linspace"):  # which do not look at rates
+            self._refuse("fps", without="--resampling first, rate or step")
+        from egosim_jax.io.video import probe_video
+
+        if fps is None and self.resampling == "first":  # all clips have the rate of the first one
+            fps = round(probe_video(first.target or first.prior).fps) or 1
+        fps = 8 if fps is None else fps
+        spec = VideoSpec(frames=self.num_frames, height=self.size[0], width=self.size[1], fps=fps)
         _grid(self.config).check(spec)
         return spec
 
@@ -224,11 +235,12 @@ class Make:
     """Side of the points of a rendered prior in pixels; must be the model's."""
     fixed_camera: bool = False
     """Keep the camera at its first pose."""
-    prior: Literal["state", "static"] = "state"
-    """Rendering of the scene along the camera path.
+    prior: Literal["state", "predicted", "static"] | None = None
+    """Rendering of the scene along the camera path; by default as for the model of --config.
 
-    state: the points of the scene state, with holes, as in EgoSim; static: the exact scene of the
-    first frame, as in DWM."""
+    state: the points of the scene state, with holes, as in EgoSim; predicted: the same, with the
+    objects on the paths that the hands predict; static: the exact scene of the first frame, as in
+    DWM."""
     hands: Literal["skeleton", "mesh", "mask"] = "skeleton"
     """Rendering of the hands: skeletons (EgoSim), shaded meshes (DWM), or their binary mask."""
     workers: int = os.cpu_count() or 1
@@ -238,9 +250,11 @@ class Make:
 
     def run(self) -> int:
         """Make all scenes."""
-        from egosim_jax.worlds.tabletop.dataset import DatasetConfig, make_shards
+        from egosim_jax import configs
+        from egosim_jax.worlds.tabletop.dataset import DatasetConfig, conditions_of, make_shards
 
         check_counts({"--workers": self.workers})
+        prior = "state" if self.config is None else conditions_of(configs.get(self.config))[0]
         spec = VideoSpec(frames=self.frames, height=self.height, width=self.width, fps=self.fps)
         config = DatasetConfig(
             seeds=tuple(range(self.seed, self.seed + self.scenes)),
@@ -249,7 +263,7 @@ class Make:
             kind=self.kind,
             black_cloths=self.black_cloths,
             attempts=self.attempts,
-            prior=self.prior,
+            prior=self.prior or prior,
             hands=self.hands,
             point_px=self.point_px,
             fixed_camera=self.fixed_camera,
@@ -277,14 +291,14 @@ class Check:
         from egosim_jax.data.manifest import read_manifest
 
         manifest = read_manifest(self.shards)
-        found = 0
+        count = 0
         for _, problems in track(check(self.shards), "checking", total=len(manifest.shards)):
             for problem in problems:
                 print(printable(problem))
-            found += len(problems)
+            count += len(problems)
         summary = f"{manifest.records} records in {len(manifest.shards)} shards"
-        print(f"{summary}: {found or 'no'} problems", file=sys.stderr)
-        return ExitCode.PARTIAL if found else ExitCode.DONE
+        print(f"{summary}: {count or 'no'} problems", file=sys.stderr)
+        return ExitCode.PARTIAL if count else ExitCode.DONE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -366,27 +380,22 @@ class Stats:
         return ExitCode.DONE
 
 
-@dataclass(frozen=True, kw_only=True)
-class Data:
-    """Prepare data: import and annotate recordings, make procedural clips, pack shards."""
-
-    command: (
-        Annotated[Annotate, tyro.conf.subcommand("annotate")]
-        | Annotated[Import, tyro.conf.subcommand("import")]
-        | Annotated[Export, tyro.conf.subcommand("export")]
-        | Annotated[Make, tyro.conf.subcommand("make")]
-        | Annotated[Pack, tyro.conf.subcommand("pack")]
-        | Annotated[Encode, tyro.conf.subcommand("encode")]
-        | Annotated[Look, tyro.conf.subcommand("look")]
-        | Annotated[Check, tyro.conf.subcommand("check")]
-        | Annotated[Stats, tyro.conf.subcommand("stats")]
-        | Annotated[Static, tyro.conf.subcommand("static")]
-        | Annotated[Align, tyro.conf.subcommand("align")]
-        | Annotated[Mix, tyro.conf.subcommand("mix")]
-        | Annotated[FromCaches, tyro.conf.subcommand("from-caches")]
-        | Annotated[ToDwm, tyro.conf.subcommand("to-dwm")]
-    )
-
-    def run(self) -> int:
-        """Run the chosen command."""
-        return self.command.run()
+Data = group(
+    "Data",
+    "Prepare data: import and annotate recordings, make procedural clips, pack shards.",
+    {
+        "annotate": Annotate,
+        "import": Import,
+        "export": Export,
+        "make": Make,
+        "pack": Pack,
+        "encode": Encode,
+        "look": Look,
+        "check": Check,
+        "stats": Stats,
+        "static": Static,
+        "align": Align,
+        "mix": Mix,
+        "to-dwm": ToDwm,
+    },
+)

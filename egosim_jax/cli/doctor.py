@@ -75,9 +75,9 @@ class Doctor:
         for line in broken:
             console.print(line)
         _print_models(console)
-        found = [row for folder in self._folders() for row in _rows(folder)]
-        _print_weights(console, found)
-        names = ", ".join(sorted({config for _, config, *_ in found})) or "no model"
+        rows = [row for folder in self._folders() for row in _rows(folder)]
+        _print_weights(console, rows)
+        names = ", ".join(sorted({config for _, config, *_ in rows})) or "no model"
         console.print(
             "Not ready: repair the modules above."
             if broken
@@ -142,13 +142,13 @@ def _print_models(console: Console) -> None:
     console.print(table)
 
 
-def _print_weights(console: Console, found: list[tuple[str, ...]]) -> None:
+def _print_weights(console: Console, rows: list[tuple[str, ...]]) -> None:
     from rich.table import Table
 
     table = Table("folder", "config", "network", "GB", "hash", title="weights found")
-    for row in found:
+    for row in rows:
         table.add_row(*row)
-    console.print(table if found else "no weights found")
+    console.print(table if rows else "no weights found")
 
 
 def _bytes(config: ModelConfig) -> int:
@@ -161,8 +161,8 @@ def _bytes(config: ModelConfig) -> int:
     parts = Networks.abstract(config).parts()
     return sum(
         leaf.size * jnp.dtype(getattr(config, network).dtype).itemsize
-        for network, part in parts.items()
-        for _, leaf in nnx.to_flat_state(nnx.state(part, nnx.Param))
+        for network, module in parts.items()
+        for _, leaf in nnx.to_flat_state(nnx.state(module, nnx.Param))
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 import tyro
 
 from egosim_jax.rendering import RendererName
-from egosim_jax.runtime.command import ExitCode, Writes
+from egosim_jax.runtime.command import ExitCode, Writes, group
 from egosim_jax.runtime.terminal import counted
 from egosim_jax.types import InputError, check_counts, check_seed, object_name
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
     from egosim_jax.data.sheet import SheetClip
     from egosim_jax.simulation import episode as episodes
-    from egosim_jax.types import Action, Cameras, SceneState
+    from egosim_jax.types import Action, SceneState
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,8 +81,8 @@ class MakeEpisode:
         from egosim_jax import configs
         from egosim_jax.worlds.tabletop import make_sequence, to_episode
 
-        own = ("prompts", "state", "image", "depth", "objects", "names", "detector", "phrases")
-        if given := [name for name in own if getattr(self, name)]:
+        of_scene = ("prompts", "state", "image", "depth", "objects", "names", "detector", "phrases")
+        if given := [name for name in of_scene if getattr(self, name)]:
             raise InputError(f"--{given[0]} needs --actions: the tabletop world makes its own.")
         video = configs.get(self.config).video
         kind = "robot" if self.robot else "human"
@@ -112,17 +113,17 @@ class MakeEpisode:
             read_action(path, height=video.height, width=video.width, prompt=prompt)
             for path, prompt in zip(self.actions, prompts, strict=True)
         )
-        state, image = self._scene(actions[0].cameras)
+        state, image = self._scene(actions)
         episode = Episode(state=state, actions=actions, fps=video.fps, first_frame=image)
         check_fits(episode, video, self.config)
         return episode
 
-    def _scene(self, cameras: Cameras) -> tuple[SceneState, np.ndarray | None]:
+    def _scene(self, actions: Sequence[Action]) -> tuple[SceneState, np.ndarray | None]:
         """Return the state, and the image, if given, at the size of the clips."""
         from egosim_jax.data.crop import plan_crop
         from egosim_jax.io.images import read_image
 
-        frame = None
+        frame, cameras = None, actions[0].cameras
         if self.image is not None:
             image = read_image(self.image)
             crop = plan_crop(
@@ -134,7 +135,7 @@ class MakeEpisode:
             frame = crop.resample(image)
             if self.depth is not None and self.state is None:
                 intrinsics = crop.source_intrinsics(cameras.intrinsics_px)
-                return self._lift(image, self.depth, intrinsics, cameras), frame
+                return self._lift(image, self.depth, intrinsics, actions), frame
         if given := [n for n in ("objects", "names", "detector", "phrases") if getattr(self, n)]:
             raise InputError(
                 f"--{given[0]} needs --image and --depth: the state of --state has its own objects."
@@ -144,13 +145,19 @@ class MakeEpisode:
         raise InputError("The scene must be given once: by --state, or by --image and --depth.")
 
     def _lift(
-        self, image: np.ndarray, depth: Path, intrinsics: np.ndarray, cameras: Cameras
+        self, image: np.ndarray, depth: Path, intrinsics: np.ndarray, actions: Sequence[Action]
     ) -> SceneState:
         """Return the points of an RGB-D image taken by the first camera."""
-        from egosim_jax.cli.objects import names_of, objects_of
-        from egosim_jax.io.untrusted.npz import read_arrays
-        from egosim_jax.state.depth import state_from_depth
+        import numpy as np
 
+        from egosim_jax.cli.objects import names_of, objects_of
+        from egosim_jax.geometry import invert, transform
+        from egosim_jax.io.untrusted.npz import read_arrays
+        from egosim_jax.perception.video.scale import check_depth_unit
+        from egosim_jax.state.depth import state_from_depth
+        from egosim_jax.types import Cameras
+
+        cameras = actions[0].cameras
         depth_m = read_arrays(depth, {}, others=("depth_m",), packed=True)["depth_m"]
         if depth_m.shape != image.shape[:2]:
             raise InputError(
@@ -158,7 +165,19 @@ class MakeEpisode:
                 "must have one value per pixel of the image as it is shown (turned as EXIF says). "
                 "Compute it from that image, or resize it to that. (--depth)"
             )
-        ids, known = objects_of(
+        joints = np.concatenate([action.joints_m.reshape(-1, 3) for action in actions])
+        taken = Cameras(
+            world_from_camera=cameras.world_from_camera[:1],
+            intrinsics_px=intrinsics,
+            height=image.shape[0],
+            width=image.shape[1],
+        )
+        local = transform(invert(taken.world_from_camera[0]), joints)
+        try:
+            check_depth_unit(taken, depth_m[None].astype(float), local[None, None])
+        except InputError as error:
+            raise InputError(f"{depth}: {error} (--depth)") from error
+        ids, names = objects_of(
             self.objects or "auto",
             image,
             depth_m,
@@ -172,7 +191,7 @@ class MakeEpisode:
             intrinsics,
             cameras.world_from_camera[0],
             object_ids=ids,
-            names=names_of(ids, known, self.names),
+            names=names_of(ids, names, self.names),
         )
 
 
@@ -366,7 +385,7 @@ def _keep_others(episode: episodes.Episode, out: Path) -> None:
     except InputError:
         return  # damaged, or no episode: `save` decides
     if fingerprint(there) != fingerprint(episode):
-        before, now = (counted(len(found.actions), "clip") for found in (there, episode))
+        before, now = (counted(len(one.actions), "clip") for one in (there, episode))
         clips = f" of {before}, not {now}" if before != now else ", maybe an edited one"
         raise InputError(
             f"{out} has another episode{clips}. It is not replaced: choose another path, or remove "
@@ -379,7 +398,7 @@ def summary(episode: episodes.Episode) -> str:
     import numpy as np
 
     frames, height, width = episode.shape
-    known = "with" if episode.ground_truth else "without"
+    with_truth = "with" if episode.ground_truth else "without"
     handless = [
         f"clip {number}"
         for number, action in enumerate(episode.actions, start=1)
@@ -389,22 +408,18 @@ def summary(episode: episodes.Episode) -> str:
     return (
         f"{counted(len(episode.actions), 'clip')} of {frames} frames of {width}x{height} at "
         f"{episode.fps} fps, {episode.actions[0].kind} hands{where}, "
-        f"{len(episode.state.points_m)} points, {known} ground truth"
+        f"{len(episode.state.points_m)} points, {with_truth} ground truth"
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Episode:
-    """Make, check and show episodes: a scene, cameras, hands and prompts to simulate."""
-
-    command: (
-        Annotated[MakeEpisode, tyro.conf.subcommand("make")]
-        | Annotated[FromAnnotation, tyro.conf.subcommand("from-annotation")]
-        | Annotated[FromLeRobot, tyro.conf.subcommand("from-lerobot")]
-        | Annotated[CheckEpisode, tyro.conf.subcommand("check")]
-        | Annotated[ShowEpisode, tyro.conf.subcommand("show")]
-    )
-
-    def run(self) -> int:
-        """Run the chosen command."""
-        return self.command.run()
+Episode = group(
+    "Episode",
+    "Make, check and show episodes: a scene, cameras, hands and prompts to simulate.",
+    {
+        "make": MakeEpisode,
+        "from-annotation": FromAnnotation,
+        "from-lerobot": FromLeRobot,
+        "check": CheckEpisode,
+        "show": ShowEpisode,
+    },
+)

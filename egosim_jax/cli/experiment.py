@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from importlib import import_module
-from typing import Annotated
-
-import tyro
+from typing import Any
 
 from egosim_jax.experiments.config import (
     DWM,
@@ -21,47 +18,33 @@ from egosim_jax.experiments.config import (
     Tabletop,
     Update,
 )
-from egosim_jax.runtime.command import ExitCode
+from egosim_jax.runtime.command import ExitCode, group
 
-MODULES = {
-    Tabletop: "tabletop",
-    Continuous: "continuous",
-    Students: "students",
-    Update: "update",
-    Embodiment: "embodiment",
-    LookAway: "look_away",
-    Policies: "policies",
-    DWM: "dwm",
-    Rank: "rank",
-    RealTiny: "real_tiny",
-    Debug: "debug",
+KINDS = {
+    "tabletop": Tabletop,
+    "continuous": Continuous,
+    "students": Students,
+    "update": Update,
+    "embodiment": Embodiment,
+    "look_away": LookAway,
+    "policies": Policies,
+    "dwm": DWM,
+    "rank": Rank,
+    "real_tiny": RealTiny,
+    "debug": Debug,
 }
-"""Config -> module of `egosim_jax.experiments`, which is also its name on the command line."""
+"""Settings of each experiment, which has the module of its name in `egosim_jax.experiments`."""
+MODULES = {kind: name for name, kind in KINDS.items()} | {Debug: "real_tiny"}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Experiment:
-    """Repeat a documented experiment, from training to its table, by one command."""
+def _run(self: Any) -> int:
+    from egosim_jax.io.executables import share_with_jax
 
-    command: (
-        Annotated[Tabletop, tyro.conf.subcommand("tabletop")]
-        | Annotated[Continuous, tyro.conf.subcommand("continuous")]
-        | Annotated[Students, tyro.conf.subcommand("students")]
-        | Annotated[Update, tyro.conf.subcommand("update")]
-        | Annotated[Embodiment, tyro.conf.subcommand("embodiment")]
-        | Annotated[LookAway, tyro.conf.subcommand("look_away")]
-        | Annotated[Policies, tyro.conf.subcommand("policies")]
-        | Annotated[DWM, tyro.conf.subcommand("dwm")]
-        | Annotated[Rank, tyro.conf.subcommand("rank")]
-        | Annotated[RealTiny, tyro.conf.subcommand("real_tiny")]
-        | Annotated[Debug, tyro.conf.subcommand("debug")]
-    )
+    share_with_jax()
+    module = import_module(f"egosim_jax.experiments.{MODULES[type(self.command)]}")
+    module.run(self.command)
+    return ExitCode.DONE
 
-    def run(self) -> int:
-        """Run the chosen experiment."""
-        from egosim_jax.io.executables import share_with_jax
 
-        share_with_jax()
-        name = MODULES[type(self.command)]
-        import_module(f"egosim_jax.experiments.{name}").run(self.command)
-        return ExitCode.DONE
+ABOUT = "Repeat a documented experiment, from training to its table, by one command."
+Experiment = group("Experiment", ABOUT, KINDS, run=_run)

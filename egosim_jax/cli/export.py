@@ -48,15 +48,15 @@ class Export:
 
         if self.to == "lerobot":
             check_new(self.out)
-        found, damaged = dataset_export.open_sessions(self.sessions, self.session)
+        sessions, damaged = dataset_export.open_sessions(self.sessions, self.session)
         for name, problem in damaged.items():
             print(printable(f"skipped session {name}: {problem}"), file=sys.stderr)
         if self.to == "lerobot":
-            dataset_export.to_lerobot(found, self.out)
+            dataset_export.to_lerobot(sessions, self.out)
         elif self.to == "shards":
-            dataset_export.to_shards(found, self.out, grid=configs.get(self.config).grid)
+            dataset_export.to_shards(sessions, self.out, grid=configs.get(self.config).grid)
         else:
-            for session in found:
+            for session in sessions:
                 dataset_export.to_rerun(session, self.out / f"{session.id}.rrd")
         print(self.out)
         return ExitCode.PARTIAL if damaged else ExitCode.DONE

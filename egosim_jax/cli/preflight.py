@@ -26,8 +26,8 @@ class Preflight:
     """Compile `generate` for a machine that need not be present; report if it fits in memory.
 
     Prints, for encoding, denoising and decoding, or for each chunk of a causal student: memory per
-    device (with the weights of all networks), the largest arrays, collectives, FLOPs and the
-    roofline time. Exit code 1 if a program does not fit.
+    device (with the weights of all networks), FLOPs and the roofline time. Exit code 1 if a program
+    does not fit.
     """
 
     config: str
@@ -73,18 +73,19 @@ class Preflight:
             raise InputError("--first-steps needs chunks: give their sizes. (--chunks)")
         mesh = make_mesh(self.mesh, target.devices)
         size = self.batch_size or parts("batch", mesh)
-        found = {}
+        by_program = {}
         for name, report in compile_generation(config, target, mesh, size):
-            found[name] = report
+            by_program[name] = report
             if not self.json:
                 text = reports.text(report)
                 print(f"{name} on {target.name}, {size} clips\n\n{text}\n", flush=True)
         if self.json:
-            values = {name: reports.plain(report) for name, report in found.items()}
+            values = {name: reports.plain(report) for name, report in by_program.items()}
             print(json.dumps(values, indent=2))
         else:
-            print(_summary(found, size))
-        return ExitCode.DONE if all(report.fits for report in found.values()) else ExitCode.FAILED
+            print(_summary(by_program, size))
+        fits = all(report.fits for report in by_program.values())
+        return ExitCode.DONE if fits else ExitCode.FAILED
 
 
 def compile_generation(
@@ -129,9 +130,9 @@ def _bytes_per_device(shapes: Any) -> int:
     )
 
 
-def _summary(found: Mapping[str, Report | OutOfMemory], size: int) -> str:
+def _summary(by_name: Mapping[str, Report | OutOfMemory], size: int) -> str:
     """Return a line with the roofline time of a batch; empty if the target's speed is unknown."""
-    seconds = {name: getattr(report, "roofline_s", math.nan) for name, report in found.items()}
+    seconds = {name: getattr(report, "roofline_s", math.nan) for name, report in by_name.items()}
     if any(map(math.isnan, seconds.values())):
         return ""
     parts = ", ".join(f"{name} {roofline:.3g}" for name, roofline in seconds.items())

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from egosim_jax.runtime.command import ExitCode
+from egosim_jax.runtime.command import ExitCode, group
 from egosim_jax.runtime.terminal import make_console
 from egosim_jax.types import InputError
 
@@ -67,7 +67,7 @@ class Render:
         from egosim_jax.data.lerobot_writer import check_new
         from egosim_jax.data.sheet import SheetClip, draw_sheet
         from egosim_jax.io.run import write_json
-        from egosim_jax.io.video import write_video
+        from egosim_jax.io.writing import write_video
         from egosim_jax.rendering import get
         from egosim_jax.robots.arms import arm_of
         from egosim_jax.robots.conversion import (
@@ -86,17 +86,17 @@ class Render:
         began = time.monotonic()
         source = open_source(self.source)
         episode = source.episode
-        found = convert(source, robot, hands=self.hands, base=self.base)
+        converted = convert(source, robot, hands=self.hands, base=self.base)
         self.out.mkdir(parents=True, exist_ok=True)
-        write_video(self.out / VIDEO, video_of(found), episode.fps)
-        first, truth = found.drawn[0], episode.ground_truth[0]
-        rows = [truth.frames, found.backgrounds[0].frames, first.frames]
+        write_video(self.out / VIDEO, video_of(converted), episode.fps)
+        first, truth = converted.drawn[0], episode.ground_truth[0]
+        rows = [truth.frames, converted.backgrounds[0].frames, first.frames]
         moments = [round(n * (len(truth.frames) - 1) / 5) for n in range(6)]
         draw_sheet([SheetClip(arm.title, rows)], self.out / SHEET, moments=moments)
-        export(found, self.out / DATASET)
+        export(converted, self.out / DATASET)
         name = re.sub("[^A-Za-z0-9_-]+", "_", f"{self.source.resolve().stem}_{arm.name}")
-        write_clips(self.out / TRIPLETS, triplets_of(found, name, get("jax")), fps=episode.fps)
-        report = {"source": self.source, "kind": source.kind, **report_of(found)}
+        write_clips(self.out / TRIPLETS, triplets_of(converted, name, get("jax")), fps=episode.fps)
+        report = {"source": self.source, "kind": source.kind, **report_of(converted)}
         seconds = round(time.monotonic() - began, 1)
         write_json(self.out / REPORT, {**report, "seconds": seconds})
         for entry in report["robots"]:
@@ -126,15 +126,11 @@ def _words(entry: Mapping[str, Any]) -> str:
     return words
 
 
-@dataclass(frozen=True, kw_only=True)
-class Robot:
-    """Turn clips with hands into clips of robots, with their joint positions."""
-
-    command: (
-        Annotated[Render, tyro.conf.subcommand("render")]
-        | Annotated[List, tyro.conf.subcommand("list")]
-    )
-
-    def run(self) -> int:
-        """Run the chosen command."""
-        return self.command.run()
+Robot = group(
+    "Robot",
+    "Turn clips with hands into clips of robots, with their joint positions.",
+    {
+        "render": Render,
+        "list": List,
+    },
+)

@@ -6,21 +6,24 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
+from jaxtyping import Float
 
 from egosim_jax.data.sheet import SheetClip, draw_sheet
-from egosim_jax.geometry import up_of
 from egosim_jax.rendering import RendererName
 from egosim_jax.rendering.portrait import write_portrait
 from egosim_jax.rendering.rerun_log import RECORDING, Recording
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.runtime.phases import phase
 from egosim_jax.runtime.terminal import counted, printable
+from egosim_jax.simulation import preview
 from egosim_jax.simulation.changes import MovedObject, moved_objects
+from egosim_jax.state.planes import vertical
 from egosim_jax.types import InputError, Kind, VideoSpec, check_counts, check_seed
 
 if TYPE_CHECKING:
@@ -31,6 +34,8 @@ if TYPE_CHECKING:
 
 SHEET_FRAMES = 6
 """Number of frames of each video on a contact sheet."""
+MODEL = "tabletop"
+"""Model by default."""
 CLIPS = 3
 """Default number of clips in the tabletop world."""
 
@@ -51,8 +56,10 @@ class Simulate:
         "scene": ("robot", "first_frame"),
         "loop": ("weights", "steps", "perception", "update", "update_every", "renderer"),
     }
-    config: str = "tabletop"
-    """Name of the model (`egosim models list`)."""
+    config: str | None = None
+    """Name of the model (`egosim models list`), or preview, which needs no weights.
+
+    By default tabletop, or a preview of a scene that is not of the tabletop world."""
     episode: Path | None = None
     """Folder or .zip of an episode (`egosim episode make`); by default the tabletop world."""
     clips: int | None = None
@@ -89,94 +96,104 @@ class Simulate:
                 f"--perception {self.perception} has no effect with --update none: give --update "
                 "full, or omit this option."
             )
-        with phase(f"loads JAX and {self.config}"):
-            from egosim_jax import configs, rendering
+        with phase(f"loads JAX and {self.config or MODEL}"):
+            from egosim_jax import rendering
             from egosim_jax.evaluation.metrics.loop import DEFINITIONS
+            from egosim_jax.generation.choose import choose
             from egosim_jax.generation.generator import Generator
             from egosim_jax.io.digest import fingerprint
             from egosim_jax.io.executables import share_with_jax
             from egosim_jax.io.journal import Journal
             from egosim_jax.io.run import open_folder, write_json
-            from egosim_jax.io.weights import hashes
             from egosim_jax.perception import registry
             from egosim_jax.perception.recorded import RecordedConfig
             from egosim_jax.simulation.rollout import OUTPUTS, Rollout
             from egosim_jax.simulation.simulator import Simulator, check_update_every
 
         share_with_jax()
-        config = configs.get(self.config)
-        config = replace(config, steps=self.steps or config.steps)
-        weights = configs.weights_of(self.config, self.weights)
-        check_update_every(self.update_every, config.chunk_frames, config.name, self.perception)
+        given = self._given()
+        maker = choose(
+            self.config,
+            self.weights,
+            default=MODEL,
+            steps=self.steps,
+            provenance=given and given.state.provenance,
+            video=given and given.video,
+        )
+        check_update_every(self.update_every, maker.chunk_frames, maker.name, self.perception)
         folder = self.out or Path("runs") / f"simulate_{self.seed}"
         pipeline = registry.parse(self.perception) if self.update == "full" else None
         reads = pipeline is not None and registry.reads_ground_truth(pipeline)
-        with phase(f"loads {self.episode}" if self.episode else "makes the tabletop scene"):
-            episode = self._episode(config.video, with_ground_truth=reads)
+        if given is not None:
+            check_fits(given, maker.video, maker.name)
+        episode = self._chosen(given or self._made(maker.video, with_ground_truth=reads))
         perception = None
         if pipeline is not None:
             if isinstance(pipeline, RecordedConfig):
                 pipeline.check_clips(len(episode.actions))
             perception = pipeline.build(episode.observations())
         made_of = {
-            "simulate": self,
-            "model": config,
-            "weights": hashes(weights, student=config.chunks is not None),
+            "simulate": replace(self, config=maker.name),
+            **maker.made_of,
             "episode": fingerprint(episode),
         }
         journal = Journal(folder, outputs=OUTPUTS)  # a damaged one is refused before the weights
         free = ["simulate.weights", "simulate.first_frame", "simulate.episode"]
         open_folder(folder, made_of, mutable=free)
         count = len(episode.actions)
-        print(f"{folder}: {counted(count, 'clip')} by {self.config}", file=sys.stderr, flush=True)
-        made_on = configs.trained_on(self.config, weights)
-        note = configs.scene_warning(made_on, episode.state.provenance)
-        if note:
+        print(f"{folder}: {counted(count, 'clip')} by {maker.name}", file=sys.stderr, flush=True)
+        if note := maker.note(episode.state.provenance):
             print(note, file=sys.stderr, flush=True)
-        outputs = _Outputs(folder, episode)
-        generator = Generator.load(config, weights, renderer=rendering.get(self.renderer))
-        if f"{count} generate" not in journal.done:
+        outputs = _Outputs(folder, episode, name=maker.name)
+        generator = maker.load(renderer=rendering.get(self.renderer))
+        if isinstance(generator, Generator) and f"{count} generate" not in journal.done:
             generator.compile(1, streamed=True)
         simulator = Simulator(
             show=outputs.show,
             generator=generator,
             perception=perception,
-            fps=config.video.fps,
+            fps=maker.video.fps,
             update_every=self.update_every,
         )
         steps = Rollout(simulator, folder).run(
             episode.state, episode.actions, seed=self.seed, first_frame=episode.first_frame
         )
-        truths = self._ground_truth(episode, config.video)
+        truths = self._ground_truth(episode, maker.video)
         report = outputs.write(simulator, steps, truths)
-        about = {"definitions": DEFINITIONS, "notes": [note] if note else [], "clips": report}
+        notes = [note] if note else []
+        about = {"definitions": DEFINITIONS, "model": maker.name, "notes": notes, "clips": report}
         write_json(folder / "report.json", about)
         if self.episode is None or episode.ground_truth:
-            _print(report)
+            _print(report, name=maker.name)
         print(folder / "contact_sheet.png")
         return ExitCode.DONE
 
-    def _episode(self, video: VideoSpec, *, with_ground_truth: bool) -> Episode:
-        """Return the episode to simulate, with the chosen clips and first frame.
-
-        The tabletop world renders its ground truth only on request; `_ground_truth` renders it
-        clip by clip.
-        """
+    def _given(self) -> Episode | None:
+        """Return the given episode; None for the tabletop world."""
         from egosim_jax.simulation.episode import Episode
 
-        if self.episode is not None:
-            if self.robot:
-                raise InputError("--robot is for the tabletop world: an episode has its own hands.")
-            episode = Episode.load(self.episode)
-            check_fits(episode, video, self.config)
-        else:
-            from egosim_jax.worlds.tabletop import episode_of_sequence, to_episode
+        if self.episode is None:
+            return None
+        if self.robot:
+            raise InputError("--robot is for the tabletop world: an episode has its own hands.")
+        with phase(f"loads {self.episode}"):
+            return Episode.load(self.episode)
 
+    def _made(self, video: VideoSpec, *, with_ground_truth: bool) -> Episode:
+        """Return an episode of the tabletop world.
+
+        Ground truth is rendered only on request; `_ground_truth` renders it clip by clip.
+        """
+        from egosim_jax.worlds.tabletop import episode_of_sequence, to_episode
+
+        with phase("makes the tabletop scene"):
             if with_ground_truth:
-                episode = to_episode(list(self._rendered(video)), fps=video.fps)
-            else:
-                count, kind = self.clips or CLIPS, self._kind
-                episode = episode_of_sequence(self.seed, spec=video, clips=count, kind=kind)
+                return to_episode(list(self._rendered(video)), fps=video.fps)
+            count, kind = self.clips or CLIPS, self._kind
+            return episode_of_sequence(self.seed, spec=video, clips=count, kind=kind)
+
+    def _chosen(self, episode: Episode) -> Episode:
+        """Return an episode with the chosen clips and first frame."""
         if self.clips is not None and self.clips > len(episode.actions):
             raise InputError(
                 f"{self.episode} has {len(episode.actions)} clips, not {self.clips}. (--clips)"
@@ -191,11 +208,11 @@ class Simulate:
             return episode
         from egosim_jax.io.images import read_image
 
-        image = read_image(self.first_frame)
-        if image.shape != (video.height, video.width, 3):
+        image, (_, height, width) = read_image(self.first_frame), episode.shape
+        if image.shape != (height, width, 3):
             raise InputError(
-                f"{self.first_frame} is {image.shape}, the clips are "
-                f"{(video.height, video.width, 3)}. (--first-frame)"
+                f"{self.first_frame} is {image.shape}, the clips are {(height, width, 3)}. "
+                "(--first-frame)"
             )
         return replace(episode, first_frame=image)
 
@@ -214,17 +231,17 @@ class Simulate:
         self, episode: Episode, video: VideoSpec
     ) -> Iterable[GroundTruth] | Iterable[None]:
         """Return the ground truth of each clip, as far as it is known."""
-        from egosim_jax.worlds.tabletop import to_known
+        from egosim_jax.worlds.tabletop import ground_truth_of
 
         if self.episode is None and not episode.ground_truth:
-            return map(to_known, self._rendered(video))
+            return map(ground_truth_of, self._rendered(video))
         return episode.ground_truth or (None,) * len(episode.actions)
 
 
 def check_fits(episode: Episode, video: VideoSpec, config: str) -> None:
     """Raise `InputError` unless an episode has the length, size and rate of a model's clips."""
     frames, height, width = episode.shape
-    own = f"{frames} frames of {width}x{height} at {episode.fps} fps"
+    of_episode = f"{frames} frames of {width}x{height} at {episode.fps} fps"
     model = f"{video.frames} of {video.width}x{video.height} at {video.fps} fps"
     shape = (*episode.shape, episode.fps)
     if shape != (video.frames, video.height, video.width, video.fps):
@@ -234,8 +251,9 @@ def check_fits(episode: Episode, video: VideoSpec, config: str) -> None:
         fitting = [n for n, v in videos.items() if shape == (v.frames, v.height, v.width, v.fps)]
         others = f"Models of such clips: {', '.join(fitting)}. " if fitting else ""
         raise InputError(
-            f"The episode has clips of {own}, and {config} generates {model}: they must be equal. "
-            f"{others}Choose another model (--config), or make the episode for this one."
+            f"The episode has clips of {of_episode}, and {config} generates {model}: they must be "
+            f"equal. {others}Choose another model, or preview, which makes any clips (--config), "
+            "or make the episode for this one."
         )
 
 
@@ -250,10 +268,23 @@ class _Outputs:
 
     folder: Path
     episode: Episode
+    name: str
+    """Name of the model, or "preview"."""
     number: int = 1
     """Number of the clip in progress."""
     shown: list[np.ndarray] = field(default_factory=list)
     """Frames of the clip in progress, in groups."""
+
+    @property
+    def _label(self) -> str:
+        """Label of the clips among other videos."""
+        return preview.NAME if self.name == preview.NAME else "generated"
+
+    @cached_property
+    def up(self) -> Float[np.ndarray, " 3"]:
+        """Direction that points up in the world."""
+        first = self.episode.actions[0].cameras.world_from_camera[0]
+        return vertical(self.episode.state, first)
 
     def show(self, frames: np.ndarray) -> None:
         """Write the video of a clip once its last frame is decoded, before it is perceived."""
@@ -262,7 +293,7 @@ class _Outputs:
             self._write_clip(np.concatenate(self.shown))
 
     def _write_clip(self, frames: np.ndarray) -> None:
-        from egosim_jax.io.video import write_video
+        from egosim_jax.io.writing import write_video
 
         path = self.folder / f"clip_{self.number}.mp4"
         write_video(path, frames, self.episode.fps)
@@ -272,7 +303,7 @@ class _Outputs:
         self, simulator: Simulator, steps: Iterator[Step], truths: Iterable[GroundTruth | None]
     ) -> list[dict[str, Any]]:
         """Write every step; return the report, one entry per clip."""
-        folder, state, up = self.folder, self.episode.state, up_of(self.episode.state)
+        folder, state = self.folder, self.episode.state
         recording = None
         report, sheet = [], []
         then = time.monotonic()
@@ -282,7 +313,7 @@ class _Outputs:
             if self.number == 1:  # not before: the first clip would have to wait
                 self._write_state(0, state)
                 if find_spec("rerun"):
-                    recording = Recording(folder / RECORDING, folder.name, up=up)
+                    recording = Recording(folder / RECORDING, folder.name, up=self.up)
             moved = moved_objects(state, step.state)
             with phase(f"clip {self.number}: scores and draws", only_if_long=True):
                 report.append(
@@ -290,7 +321,7 @@ class _Outputs:
                         "clip": self.number,
                         "action": action.prompt,
                         "notes": list(step.notes),
-                        "moved": [asdict(found) for found in moved],
+                        "moved": [asdict(change) for change in moved],
                         **({} if step.latency is None else asdict(step.latency)),
                         **_score(simulator, step, action, truth),
                     }
@@ -331,10 +362,10 @@ class _Outputs:
         self, simulator: Simulator, step: Step, action: Action, truth: GroundTruth | None
     ) -> SheetClip:
         """Write videos and state of one step; return its part of the contact sheet."""
-        from egosim_jax.io.video import write_video
+        from egosim_jax.io.writing import write_video
 
         hands = simulator.renderer.draw_hands(action.joints_m, action.cameras, kind=action.kind)[0]
-        videos = {"view": step.view.frames, "hands": hands, "generated": step.clip.frames}
+        videos = {"view": step.view.frames, "hands": hands, self._label: step.clip.frames}
         if truth is not None:
             videos["ground truth"] = truth.frames
         side_by_side = np.concatenate(list(videos.values()), axis=2)
@@ -348,8 +379,7 @@ class _Outputs:
         from egosim_jax.state.snapshot import write_ply
 
         write_ply(self.folder / f"state_{number}.ply", state)
-        up = up_of(self.episode.state)
-        write_portrait(self.folder / f"state_{number}.png", state, up=up)
+        write_portrait(self.folder / f"state_{number}.png", state, up=self.up)
 
 
 def _score(
@@ -368,7 +398,7 @@ def _score(
     )
 
 
-def _print(report: Sequence[Mapping[str, Any]]) -> None:
+def _print(report: Sequence[Mapping[str, Any]], *, name: str) -> None:
     from egosim_jax.evaluation.metrics.loop import MEASURES
     from egosim_jax.evaluation.metrics.report import print_table
 
@@ -380,4 +410,5 @@ def _print(report: Sequence[Mapping[str, Any]]) -> None:
         }
         for line in report
     }
-    print_table("clip", rows, shown, caption="report.json defines these measures")
+    made = f"{name}s, not clips of a model; " if name == preview.NAME else ""
+    print_table("clip", rows, shown, caption=f"{made}report.json defines these measures")

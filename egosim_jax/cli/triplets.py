@@ -1,4 +1,4 @@
-"""`egosim data static`, `align`, `to-dwm`, `mix` and `from-caches`: DWM's static-scene data."""
+"""`egosim data static`, `align`, `to-dwm` and `mix`: DWM's static-scene data."""
 
 from __future__ import annotations
 
@@ -8,14 +8,12 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from egosim_jax.data.clip_files import Prompts
 from egosim_jax.runtime.command import ExitCode, Writes
 from egosim_jax.runtime.progress import track
 from egosim_jax.runtime.terminal import make_console, printable
 from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:
-    from egosim_jax.configs.model import ModelConfig
     from egosim_jax.rendering.mesh import MovingMesh
 
 
@@ -143,24 +141,24 @@ class Align:
             "aligned",
             "gain",
         )
-        found = {}
+        results = {}
         for files in track(clips, "aligning", total=len(clips)):
             try:
                 result = align_clip(files.prior, files.target, most_px=self.most_px)
             except InputError as error:
                 print(printable(f"skipped: {files.video_id}: {error}"), file=sys.stderr)
                 continue
-            found[files.video_id] = {**dataclasses.asdict(result), "gain": result.gain}
+            results[files.video_id] = {**dataclasses.asdict(result), "gain": result.gain}
             levels = result.psnr_full, result.psnr_inside, result.psnr_aligned, result.gain
             table.add_row(
                 files.video_id, *map(str, result.shift_px), *(f"{level:.2f}" for level in levels)
             )
         make_console().print(table)
         if self.out is not None:
-            write_json(self.out, {"most_px": self.most_px, "clips": found})
-        if not found:
+            write_json(self.out, {"most_px": self.most_px, "clips": results})
+        if not results:
             return ExitCode.USAGE
-        return ExitCode.PARTIAL if len(found) < len(clips) else ExitCode.DONE
+        return ExitCode.PARTIAL if len(results) < len(clips) else ExitCode.DONE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,16 +181,9 @@ class ToDwm:
     Shards have no frame rate if `data pack` took frames by another --resampling than rate."""
     limit: int | None = None
     """Maximum number of clips."""
-    caches: str | None = None
-    """Name of a model: also write its caches of latents and captions.
-
-    The folders are video_latents, static_video_latents, hand_video_latents and
-    prompt_embeds_rewrite. `data from-caches` reads them."""
-    weights: Path | None = None
-    """With --caches, folder of weights with the VAE and the text encoder."""
 
     def run(self) -> int:
-        """Write all clips, then their caches if asked for."""
+        """Write all clips."""
         from itertools import islice
 
         from egosim_jax.data.dwm import write_folders
@@ -200,57 +191,32 @@ class ToDwm:
         from egosim_jax.data.shards import ShardReader
 
         check_counts({"--fps": self.fps, "--limit": self.limit})
-        model = self._cached_model()
         reader = ShardReader(self.shards)
         count = min(len(reader), self.limit or len(reader))
         fps = _one_rate(frame_rates(reader, count), self.fps, of="--shards")
         triplets = track(islice(read_triplets(reader), count), "writing", total=count)
         path = write_folders(self.out, triplets, name=self.name, fps=fps)
-        if model is not None and self.weights is not None:
-            from egosim_jax.data.dwm import read_list
-            from egosim_jax.train.cached import write_caches
-
-            clips = read_list(path, first_line=True)
-            written = write_caches(model, self.weights, clips)
-            for _ in track(written, "encoding", total=len(clips)):
-                pass
         print(path)
         return ExitCode.DONE
 
-    def _cached_model(self) -> ModelConfig | None:
-        """Return the model of --caches, if given."""
-        if self.caches is None and self.weights is None:
-            return None
-        if self.caches is None or self.weights is None:
-            raise InputError(
-                f"Caches are made by a model with weights: give both, not --caches "
-                f"{self.caches} with --weights {self.weights}. (--caches, --weights)"
-            )
-        from egosim_jax import configs
-        from egosim_jax.train.cached import check_cached
 
-        model = configs.get(self.caches).at(self.weights)
-        check_cached(model)
-        return model
-
-
-def _one_rate(known: Collection[Fraction], given: int | None, *, of: str) -> Fraction:
-    """Return the one frame rate of all videos: `known` from the input, or given by --fps.
+def _one_rate(rates_of_videos: Collection[Fraction], given: int | None, *, of: str) -> Fraction:
+    """Return the one frame rate of all videos: from the input, or given by --fps.
 
     Raises `InputError` if there is no rate, or more than one. `of` is the option of the input.
     """
-    rates = {*known} if given is None else {*known, Fraction(given)}
+    rates = {*rates_of_videos} if given is None else {*rates_of_videos, Fraction(given)}
     if not rates:
         raise InputError(f"The clips have no frame rate: give it. (--fps, {of})")
-    if len(known) > 1:
+    if len(rates_of_videos) > 1:
         raise InputError(
             f"The videos have {_listed(rates)} frames per second: all must have one rate. Pack "
             f"separate shards for each rate. ({of})"
         )
     if len(rates) > 1:
         raise InputError(
-            f"The videos have {_listed(known)} frames per second, not {given}: their frames must "
-            f"keep this rate. Omit --fps. (--fps, {of})"
+            f"The videos have {_listed(rates_of_videos)} frames per second, not {given}: their "
+            f"frames must keep this rate. Omit --fps. (--fps, {of})"
         )
     return rates.pop()
 
@@ -285,47 +251,5 @@ class Mix:
                 "every folder once. (--weights, --shards)"
             )
         write_mixture(self.out, dict(zip(self.shards, weights, strict=True)))
-        print(self.out)
-        return ExitCode.DONE
-
-
-@dataclass(frozen=True, kw_only=True)
-class FromCaches:
-    """Make latents shards from DWM's caches of moments and embeddings. Prints the folder.
-
-    The first clip is also encoded and compared with its caches. They are refused if they come from
-    another VAE or text encoder.
-    """
-
-    config: str
-    """Name of the model."""
-    weights: Path
-    """Folder of weights with the VAE and the text encoder of the caches."""
-    metadata: Path
-    """DWM list, .txt."""
-    out: Path
-    """Folder of the latents shards."""
-    prompts: Prompts = "prompts_rewrite"
-    """Captions of the list; the caches must contain embeddings of their first lines.
-
-    prompts_rewrite: rewritten captions, as in the released models, or the original caption where
-    there is no rewritten one; prompts: original captions, as in the paper's evaluation."""
-    limit: int | None = None
-    """Maximum number of clips."""
-
-    def run(self) -> int:
-        """Check the first clip, then read all caches."""
-        from egosim_jax import configs
-        from egosim_jax.data.dwm import read_list
-        from egosim_jax.data.metadata import select
-        from egosim_jax.train.cached import shard_caches
-
-        clips = read_list(self.metadata, prompts=self.prompts, first_line=True)
-        clips = select(clips, limit=self.limit)
-        model = configs.get(self.config).at(self.weights)
-        for _ in track(
-            shard_caches(model, self.weights, clips, out=self.out), "reading", total=len(clips)
-        ):
-            pass
         print(self.out)
         return ExitCode.DONE

@@ -1,4 +1,4 @@
-"""`egosim view`: draw a scene state, open a simulation, or make the page of a training run."""
+"""`egosim view`: draw a scene state, or open a simulation."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
+import numpy as np
 import tyro
 
-from egosim_jax.geometry import Up, up_of
+from egosim_jax.geometry import UP_AXES, Up
 from egosim_jax.io.journal import NAME as JOURNAL
 from egosim_jax.rendering.portrait import write_portrait
 from egosim_jax.rendering.rerun_log import RECORDING
 from egosim_jax.runtime.command import ExitCode, Writes
 from egosim_jax.runtime.terminal import printable
-from egosim_jax.train.run_page import PAGE, stages_of, write_page
+from egosim_jax.state.planes import vertical
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -25,29 +26,30 @@ if TYPE_CHECKING:
 
 IMAGES = (".png", ".jpg", ".jpeg", ".webp")
 """Suffixes of the images that the command draws."""
+PAGE = "index.html"
+"""Page of an evaluation or of annotated clips."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """Draw a state or a point cloud, open a simulation in Rerun, or make a page of a training run.
+    """Draw a state or a point cloud, or open a simulation in Rerun.
 
     PATH is one of: the folder of a simulation, or its simulation.rrd (extra `viewer`); the folder
-    of a state, such as OUT/clip_1/state; a PLY file of colored points; the folder of a training
-    run, finished or not. The page shows curves, sample clips and settings.
+    of a state, such as OUT/clip_1/state; a PLY file of colored points.
     """
 
     writes: ClassVar[Writes] = "file"
     path: Annotated[Path, tyro.conf.Positional]
     """Folder or file to view."""
     out: Path | None = None
-    """File to write; by default NAME.png here, or index.html in the folder of a training run."""
+    """Image to write; by default NAME.png here."""
     up: Up | None = None
-    """World axis that points up; by default z in the tabletop world and -y elsewhere."""
+    """World axis that points up; by default z or -y, whichever the table's normal is nearer to."""
     host: str = "127.0.0.1"
     """Address of the Rerun viewer; by default only this machine can reach it."""
 
     def run(self) -> int:
-        """Draw the state, open the viewer, or write the page."""
+        """Draw the state, or open the viewer."""
         recording = self.path / RECORDING if self.path.is_dir() else self.path
         if recording.suffix == ".rrd" and recording.exists():
             self._refuse_out("a recording is opened")
@@ -64,16 +66,20 @@ class View:
                 f"{self.path} has no {RECORDING}, which egosim simulate writes where Rerun is "
                 f"installed: {install}run the same command again, which adds it{state}."
             )
-        if self.path.is_dir() and stages_of(self.path):
-            print(write_page(self.path, self.out))
-            return ExitCode.DONE
+        if any(path for name in ("times.json", "*/times.json") for path in self.path.glob(name)):
+            raise InputError(
+                f"{self.path} is a training: metrics.jsonl has its curves, samples/ its clips. "
+                f"TensorBoard draws curves that training wrote for it: tensorboard --logdir "
+                f"{self.path}. (--training.tensorboard)"
+            )
         out = self.out or Path(f"{self.path.stem}.png")
         if out.suffix.lower() not in IMAGES:
             raise InputError(
                 f"{out} is no image: its name must end in {', '.join(IMAGES)}. (--out)"
             )
         state = self._state()
-        write_portrait(out, state, up=self.up or up_of(state))
+        up = vertical(state) if self.up is None else np.array(UP_AXES[self.up])
+        write_portrait(out, state, up=up)
         low, high = state.points_m.min(axis=0), state.points_m.max(axis=0)
         size = " x ".join(f"{length:.2f}" for length in high - low)
         objects = ", ".join(state.names.values()) or "no named objects"
@@ -93,8 +99,8 @@ class View:
         if self.path.suffix == ".ply":
             return read_ply(self.path)
         raise InputError(
-            f"{self.path} cannot be viewed: give the folder of a simulation, of a training or of a "
-            "state, a .rrd or a .ply."
+            f"{self.path} cannot be viewed: give the folder of a simulation or of a state, a .rrd "
+            "or a .ply."
         )
 
 

@@ -118,11 +118,16 @@ def release(name: str, *, others: Iterable[str] = ()) -> hub.Release:
     return known[name]
 
 
+def training_of(name: str) -> str | None:
+    """Return the command that trains the weights of a config, if one does."""
+    return getattr(_module(name), "TRAINING", None)
+
+
 def _origin(name: str) -> str:
     """Return how to get the weights of a config."""
     if name in releases():
         return f"Fetch them: egosim models fetch {name}"
-    if training := getattr(_module(name), "TRAINING", None):
+    if training := training_of(name):
         return f"Train them: {training}"
     return (
         f"Convert a download: egosim convert weights DOWNLOAD --config {name} --out weights/{name}"
@@ -175,6 +180,6 @@ def scene_warning(world: str | None, provenance: Mapping[str, str]) -> str | Non
     return (
         f"The weights were trained on clips of the {world} world, and this scene is not of it: "
         "expect blurred clips, whose objects may stay or turn where a hand carries them. Train on "
-        f"your own clips ({_module('real_tiny').TRAINING}), or fetch EgoSim's weights (egosim "
+        f"your own clips ({training_of('real_tiny')}), or fetch EgoSim's weights (egosim "
         "models fetch egosim_14b) for --config egosim_14b."
     )

@@ -17,8 +17,8 @@ from egosim_jax.diffusion.guidance import Guidance
 from egosim_jax.diffusion.process import VariancePreserving
 from egosim_jax.diffusion.solver import DDIM
 from egosim_jax.models.cogvideox.dit import CogVideoXDiTConfig
-from egosim_jax.models.cogvideox.t5 import T5Config
 from egosim_jax.models.cogvideox.vae import CogVideoXVAEConfig
+from egosim_jax.models.t5 import T5Config
 from egosim_jax.types import VideoSpec
 
 CONFIG = ModelConfig(

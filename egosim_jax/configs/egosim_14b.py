@@ -9,9 +9,9 @@ from pathlib import Path
 from egosim_jax.conditioning.text import PromptTokenizer
 from egosim_jax.configs.model import ModelConfig
 from egosim_jax.diffusion.process import RectifiedFlow
+from egosim_jax.models.t5 import UMT5Config
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
 from egosim_jax.models.wan.dit import WanDiTConfig
-from egosim_jax.models.wan.umt5 import UMT5Config
 from egosim_jax.models.wan.vae import WanVAEConfig
 from egosim_jax.types import VideoSpec
 

@@ -17,11 +17,10 @@ from jaxtyping import Float
 from egosim_jax.conditioning.layout import ChannelLayout
 from egosim_jax.conditioning.posterior import EncodingNoise
 from egosim_jax.conditioning.text import PromptTokenizer
-from egosim_jax.diffusion.dpm import DPMSolver
+from egosim_jax.diffusion.caching import StepCache
 from egosim_jax.diffusion.guidance import Guidance
 from egosim_jax.diffusion.process import RectifiedFlow, VariancePreserving
-from egosim_jax.diffusion.solver import DDIM, Euler
-from egosim_jax.diffusion.unipc import UniPC
+from egosim_jax.diffusion.solver import Euler, Solver
 from egosim_jax.io import weights
 from egosim_jax.io.executables import cached_trace
 from egosim_jax.models import (
@@ -41,10 +40,10 @@ from egosim_jax.models import (
 )
 from egosim_jax.models.chunks import Chunks
 from egosim_jax.models.layers import init_sharded
+from egosim_jax.models.t5 import UMT5Config
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
-from egosim_jax.models.wan.umt5 import UMT5Config
 from egosim_jax.models.wan.vae import WanVAEConfig
-from egosim_jax.rendering import POINT_PX
+from egosim_jax.rendering import POINT_PX, PriorKind
 from egosim_jax.types import InputError, Triplet, VideoGrid, VideoSpec, check_counts
 
 Name = Literal["dit", "vae", "text", "image"]
@@ -80,6 +79,10 @@ class ModelConfig:
     """Side of the points of a rendered prior in pixels, in training and in generation.
 
     Gaps between points of one pixel are closed."""
+    prior: PriorKind = "static"
+    """Objects in a rendered prior: where the state has them, or on their predicted paths.
+
+    EgoSim and DWM were trained on static priors."""
     tokenizer: PromptTokenizer = field(default_factory=PromptTokenizer)
     """Tokenizer of the prompts."""
     encoders: Literal["frozen", "joint"] = "frozen"
@@ -92,7 +95,7 @@ class ModelConfig:
     """Noise in the encoding of conditions at generation; None: no noise."""
     process: RectifiedFlow | VariancePreserving = field(default_factory=RectifiedFlow)
     """Path from data to noise, and the quantity that the denoiser predicts."""
-    solver: Euler | DDIM | UniPC | DPMSolver = field(default_factory=Euler)
+    solver: Solver = field(default_factory=Euler)
     """Sampler of the denoising steps."""
     guidance: Guidance = field(default_factory=Guidance)
     """Classifier-free guidance on the text."""
@@ -107,6 +110,8 @@ class ModelConfig:
     The prior is then not a condition. None: all steps, from pure noise."""
     steps: int | tuple[int | float, ...] = 50
     """Number of denoising steps, or the timesteps to visit."""
+    cache: StepCache | None = None
+    """Reuse of predictions at steps where they would hardly change; None: every step is exact."""
     chunks: Chunks | None = None
     """Chunks that the denoiser makes one after the other, a causal student; None: all at once."""
 
@@ -168,6 +173,7 @@ class ModelConfig:
             ("guidance.scale", self.guidance.scale, 1.0),
             ("strength", self.strength, None),
             ("encoding_noise", self.encoding_noise, None),
+            ("cache", self.cache, None),
         ):
             if value != usual:
                 raise InputError(
@@ -352,6 +358,7 @@ class Networks(nnx.Module):
         networks, folder = cls.abstract(config, only=only), Path(folder)
         if not folder.is_dir():
             raise InputError(f"{folder} is not a folder of weights. (--weights)")
+        weights.check_record(folder, networks.parts().keys())
         for name, network in networks.parts().items():
             file = folder / f"{name}.safetensors"
             student = None
@@ -362,11 +369,13 @@ class Networks(nnx.Module):
                 lora.merge(network, student, base=weights.hashes(folder, only=["dit"])["dit"])
         return networks
 
-    def save(self, folder: Path, *, dtype: str | None = None) -> None:
+    def save(self, folder: Path | str, *, dtype: str | None = None) -> None:
         """Write a weights folder, cast to `dtype` if given."""
         for name, network in self.parts().items():
             metadata = metadata_of(name, self.chunks)
-            weights.save(folder / f"{name}.safetensors", network, dtype=dtype, metadata=metadata)
+            weights.save(
+                Path(folder) / f"{name}.safetensors", network, dtype=dtype, metadata=metadata
+            )
 
     def parts(self) -> dict[str, nnx.Module]:
         """Return the networks that are present, by name."""

@@ -14,7 +14,7 @@ from egosim_jax.data.records import Record, RecordError, from_bytes
 from egosim_jax.io.bounded import named, quote
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.images import decode_image
-from egosim_jax.io.video import decode_video
+from egosim_jax.io.video import read_video
 from egosim_jax.types import InputError, VideoGrid
 
 
@@ -22,7 +22,8 @@ def check(folder: Path) -> Iterator[tuple[ShardInfo, list[str]]]:
     """Yield each shard of a folder with its problems; every problem names the file.
 
     Compares size and SHA-256 with the manifest, reads every record, compares its arrays with the
-    manifest, decodes all videos and images and searches for non-finite numbers. Raises `InputError`
+    manifest and with each other, decodes all videos and images and searches for non-finite
+    numbers. Raises `InputError`
     if the manifest is missing or invalid.
     """
     manifest = read_manifest(folder)
@@ -67,6 +68,11 @@ def _record_problems(record: Record, manifest: Manifest) -> list[str]:
     if manifest.kind == "videos":
         problems += _video_problems(record.arrays, manifest.grid)
     else:
+        if manifest.kind == "frames" and manifest.spec is not None:
+            spec = manifest.spec
+            sizes = {name: a.shape[:3] for name, a in record.arrays.items() if a.ndim >= 3}
+            sizes |= {n: (spec.frames, *s[:2]) for n, s in sizes.items() if n == "first_frame"}
+            problems += _differing({"spec": (spec.frames, spec.height, spec.width), **sizes})
         problems += [
             f"{name} has values that are not finite"
             for name, array in record.arrays.items()
@@ -96,16 +102,20 @@ def _shape_problems(
 
 
 def _video_problems(arrays: Mapping[str, np.ndarray], grid: VideoGrid) -> list[str]:
-    problems, counts = [], {}
+    problems, sizes = [], {}
     for name, array in arrays.items():
         try:
             if name == "first_frame":
                 decode_image(array.tobytes(), name=name)
             else:
-                counts[name] = len(decode_video(array.tobytes(), name=name).frames)
-                grid.check_frames(counts[name], what=name, fix="pack the clip again")
+                sizes[name] = read_video(array.tobytes(), name=name).frames.shape[:3]
+                grid.check_frames(sizes[name][0], what=name, fix="pack the clip again")
         except InputError as error:
             problems.append(str(error))
-    if len(set(counts.values())) > 1:
-        problems.append(f"the frame counts disagree: {counts}")
-    return problems
+    return problems + _differing(sizes)
+
+
+def _differing(sizes: Mapping[str, tuple[int, ...]]) -> list[str]:
+    """Return a problem if frames, heights or widths disagree."""
+    disagree = len(set(sizes.values())) > 1
+    return [f"the frames and sizes disagree: {dict(sizes)}"] if disagree else []

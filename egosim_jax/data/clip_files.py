@@ -14,6 +14,8 @@ Prompts = Literal["prompts_rewrite", "prompts"]
 """Captions to read from DWM's folders: rewritten (else the original), or original only."""
 MAX_CLIPS = 400_000
 """Maximum number of clips in a metadata file or list."""
+PRIOR_KIND = "prior_kind"
+"""Column of the metadata with the kind of a clip's prior."""
 SAFE_IDS = "letters, digits, '.', '_' and '-', and '/' between folders without dots"
 """Rule of a safe id, for messages."""
 _SAFE_ID = re.compile(r"(?:[A-Za-z0-9_-]+/)*[A-Za-z0-9_-][A-Za-z0-9._-]*")
@@ -73,3 +75,19 @@ class Problems:
             self._shown.append(f"and {self._count - self.MAX_SHOWN:,} more")
         if self._count:
             raise InputError(f"{message}: {'; '.join(self._shown)}.")
+
+
+def prior_column(prior: str) -> dict[str, str]:
+    """Return the column of the metadata that says how priors were made; none if they are static."""
+    return {} if prior == "static" else {PRIOR_KIND: prior}
+
+
+def prior_problem(extra: Mapping[str, str], prior: str) -> str | None:
+    """Say how a clip's prior contradicts the model's; None if it does not, or is unknown."""
+    kind = extra.get(PRIOR_KIND, prior)
+    if kind == prior:
+        return None
+    return (
+        f"its prior is {kind!r}, and the model's priors are {prior}: make it again "
+        f"(`egosim data annotate --prior {prior}`). (--metadata, --shards)"
+    )

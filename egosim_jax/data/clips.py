@@ -28,6 +28,7 @@ from egosim_jax.data.metadata import MASK_NAME, csv_rows
 from egosim_jax.data.transforms import (
     Resampling,
     fit_length,
+    rate_problem,
     resample,
     resize_image,
     resize_mask,
@@ -37,16 +38,15 @@ from egosim_jax.io.bounded import listing, quote, quote_path, quote_text, read_b
 from egosim_jax.io.decoding import Damage, Decoding
 from egosim_jax.io.images import MAX_IMAGE_BYTES, read_image
 from egosim_jax.io.run import write_text
-from egosim_jax.io.timing import CONVERT
-from egosim_jax.io.video import VIDEO_SUFFIXES, VideoInfo, probe_video, read_video, write_video
+from egosim_jax.io.timing import CONVERT, MAX_RATE_RATIO
+from egosim_jax.io.video import VIDEO_SUFFIXES, VideoInfo, probe_video, read_video
+from egosim_jax.io.writing import write_video
 from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import WAN_GRID, InputError, Triplet, VideoGrid, VideoSpec
 
 logger = logging.getLogger(__name__)
 
 Policy = Literal["strict", "lenient"]
-MAX_RATE_RATIO = 1.01
-"""Maximum ratio of frame rates that count as equal, such as 24 and 23.976."""
 DAMAGE: dict[Policy, Damage] = {"strict": "refuse", "lenient": "stop"}
 LENIENT = "egosim generate --lenient"
 """The one command with the lenient policy, and its option."""
@@ -132,12 +132,15 @@ def check_clip(
     policy: Policy = "strict",
     grid: VideoGrid = WAN_GRID,
     resampling: Resampling = "first",
+    fps: int | None = None,
 ) -> list[str]:
     """List the problems that would make `load_triplet` fail, without decoding the videos.
 
     Each problem names the metadata row and the file. Without a `spec`, every length is accepted.
-    With frames taken at intervals, every sufficient length is accepted.
+    With frames taken at intervals, every sufficient length is accepted. `fps` is the frame rate to
+    have; by default the one of `spec`.
     """
+    fps = spec.fps if spec is not None and fps is None else fps
     problems = []
     probed: dict[str, VideoInfo] = {}
     sizes: dict[str, tuple[int, int]] = {}
@@ -151,8 +154,8 @@ def check_clip(
         sizes["first_frame"] = _read_first_frame(files.first_frame).shape[:2]
     except InputError as error:
         problems.append(str(error))
-    if resampling == "rate" or (resampling == "first" and policy == "strict"):
-        problems += _rate_problems(probed)
+    if resampling in ("rate", "step") or (resampling == "first" and policy == "strict"):
+        problems += _rate_problems(probed) or _model_problems(probed, fps, resampling)
     if policy == "strict":
         taken = _taken(probed, spec, resampling)
         problems += _length_problems(probed, taken, start + (spec.frames if spec else 1), grid)
@@ -189,10 +192,10 @@ def load_triplet(
         "mask": np.zeros((spec.frames, spec.height, spec.width), np.uint8)
     }
     videos = _videos(files, policy)
-    step = 1
-    if resampling == "rate":
+    ratio = Fraction(1)
+    if resampling in ("rate", "step"):
         probed = {name: probe_video(path, damage=DAMAGE[policy]) for name, path in videos.items()}
-        step = _step(probed, spec)
+        ratio = _ratio(probed, spec)
     for name, path in videos.items():
         fit = _fit_mask if name == "mask" else resize_image
         try:
@@ -204,7 +207,7 @@ def load_triplet(
                 damage=DAMAGE[policy],
                 each=partial(fit, height=spec.height, width=spec.width),
             )
-            frames = video.frames[resample(len(video.frames), spec.frames, resampling, step=step)]
+            frames = video.frames[resample(len(video.frames), spec.frames, resampling, ratio=ratio)]
         except InputError as error:
             raise InputError(f"{files.row} ({files.video_id}): {error}") from error
         if len(frames) < spec.frames:
@@ -251,17 +254,35 @@ def _taken(
     """Return the number of frames of each video that can be taken."""
     if spec is None or resampling == "first":
         return {name: info.frames for name, info in probed.items()}
-    step = _step(probed, spec)
+    ratio = _ratio(probed, spec)
     return {
-        name: len(resample(info.frames, spec.frames, resampling, step=step))
+        name: len(resample(info.frames, spec.frames, resampling, ratio=ratio))
         for name, info in probed.items()
     }
 
 
-def _step(probed: dict[str, VideoInfo], spec: VideoSpec) -> int:
-    """Return the step of the rule `rate` for all videos, by the rate of the target or the prior."""
+def _ratio(probed: dict[str, VideoInfo], spec: VideoSpec) -> Fraction:
+    """Return the rate of the videos, by the target or the prior, divided by the model's."""
     timed = probed.get("target") or probed.get("prior")
-    return int(timed.fps / spec.fps) if timed else 1
+    return timed.fps / spec.fps if timed else Fraction(1)
+
+
+def _model_problems(
+    probed: dict[str, VideoInfo], fps: int | None, resampling: Resampling
+) -> list[str]:
+    """List how the videos' rate contradicts the rate to have."""
+    timed = probed.get("target") or probed.get("prior")
+    if timed is None or fps is None:
+        return []
+    if resampling != "first":
+        slow = timed.fps * MAX_RATE_RATIO < fps
+        return [f"{rate_problem(timed.fps, fps)} (--resampling {resampling})"] if slow else []
+    if (problem := rate_problem(timed.fps, fps)) is None:
+        return []
+    return [
+        f"{problem} Take the frames nearest in time (`egosim data pack --resampling rate`), or "
+        f"write all videos at this rate with `{CONVERT.format(fps)}`. ({LENIENT} does not look)"
+    ]
 
 
 def _rate_problems(probed: dict[str, VideoInfo]) -> list[str]:

@@ -27,7 +27,7 @@ from egosim_jax.data.readers import inside, make_id
 from egosim_jax.data.static import check_observed
 from egosim_jax.io.bounded import quote, quote_path, quote_text, read_bytes
 from egosim_jax.io.run import write_text
-from egosim_jax.io.video import write_video
+from egosim_jax.io.writing import write_video
 from egosim_jax.types import InputError, Triplet
 
 VIDEOS, STATIC, HANDS = "videos", "videos_static", "videos_hands"
@@ -43,14 +43,11 @@ MAX_LIST_BYTES, MAX_PROMPT_BYTES = 1 << 26, 1 << 16
 """Maximum size of a list and of a caption, in bytes."""
 
 
-def read_list(
-    path: Path, *, prompts: Prompts = "prompts_rewrite", first_line: bool = False
-) -> list[ClipFiles]:
+def read_list(path: Path, *, prompts: Prompts = "prompts_rewrite") -> list[ClipFiles]:
     """Return the clips of a list; their ids are their paths with underscores.
 
-    `prompts` chooses the captions; `first_line` takes only the first line of each, as DWM's caches
-    of embeddings do. Raises one `InputError` that lists the problems: no root, paths outside of it
-    or not in a folder `videos`, missing and empty captions, duplicates.
+    `prompts` chooses the captions. Raises one `InputError` that lists the problems: no root, paths
+    outside of it or not in a folder `videos`, missing and empty captions, duplicates.
     """
     entries = list(_entries(path))
     name = quote_path(path)
@@ -62,7 +59,7 @@ def read_list(
     for line, entry in entries:
         try:
             row = f"{path.name} line {line}"
-            files = _files(root, entry, row, prompts, first_line=first_line)
+            files = _files(root, entry, row, prompts)
             if files.video_id in clips:
                 raise InputError(f"another line has the same id {files.video_id}")
             clips[files.video_id] = files
@@ -102,7 +99,7 @@ def _root_of(path: Path, entry: str) -> Path:
     )
 
 
-def _files(root: Path, entry: str, row: str, prompts: Prompts, *, first_line: bool) -> ClipFiles:
+def _files(root: Path, entry: str, row: str, prompts: Prompts) -> ClipFiles:
     video = inside(root, entry, what="the path")
     if video.parent.name != VIDEOS or video.suffix != ".mp4":
         raise InputError(
@@ -111,11 +108,11 @@ def _files(root: Path, entry: str, row: str, prompts: Prompts, *, first_line: bo
         )
     folder = video.parent.parent
     texts = [folder / name / f"{video.stem}.txt" for name in PROMPTS[prompts]]
-    found = next((text for text in texts if text.is_file()), texts[0])
-    text = _text(found, MAX_PROMPT_BYTES)
-    prompt = " ".join((text.splitlines()[0] if first_line and text else text).split())
+    caption = next((text for text in texts if text.is_file()), texts[0])
+    text = _text(caption, MAX_PROMPT_BYTES)
+    prompt = " ".join(text.split())
     if not prompt:
-        raise InputError(f"the caption {quote_path(found)} is empty")
+        raise InputError(f"the caption {quote_path(caption)} is empty")
     static = folder / STATIC / video.name
     parts = Path(entry).with_suffix("").parts
     return ClipFiles(

@@ -2,12 +2,13 @@
 
     DIR/<recording_id>/recording.json, arrays.npz, and for images also video.mp4 and depth/
 
-A recording is complete when its recording.json exists, so an interrupted import resumes. A damaged
-recording is imported again; one that another source or other options made is refused.
+A folder appears when its recording is complete, so a refused or interrupted one leaves nothing. A
+damaged recording is imported again; one that another source or other options made is refused.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -15,13 +16,15 @@ from pathlib import Path
 
 from egosim_jax.data.readers import NOTE, Entry, Reader
 from egosim_jax.data.recorded_files import DESCRIPTION
-from egosim_jax.data.recording import Recording
-from egosim_jax.io.atomic import lock_folder
-from egosim_jax.io.bounded import check_inside, only_inside
+from egosim_jax.data.recording import ARRAYS, Recording
+from egosim_jax.io.atomic import atomic_folder, check_replaceable, lock_folder
+from egosim_jax.io.bounded import only_inside, open_regular
 from egosim_jax.types import InputError, check_counts
 
 FIXED = {"camera": "fixed"}
 """Provenance of a recording whose dataset has a camera at rest."""
+_FILES = re.compile(rf"{re.escape(DESCRIPTION)}|{re.escape(ARRAYS)}|video\.mp4|depth/\d+\.png")
+"""Paths of the files in the folder of a recording."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,12 +93,14 @@ def _import_one(dataset: str, entry: Entry, folder: Path) -> Outcome:
                     "another folder, or remove it. (--out)"
                 )
             return Outcome(recording_id=entry.recording_id, resumed=True, note=written.get(NOTE))
-    recording = _without_placeholders(entry.read(folder))
-    for path in recording.depth.paths if recording.depth else ():
-        if path is not None:
-            check_inside(path)
-    provenance = {**recording.provenance, **made_of}
-    replace(recording, recording_id=entry.recording_id, provenance=provenance).save(folder)
+    folder = check_replaceable(folder, _FILES, description=DESCRIPTION)
+    with atomic_folder(folder) as temporary:
+        recording = _without_placeholders(entry.read(temporary))
+        for path in recording.depth.paths if recording.depth else ():
+            if path is not None:
+                open_regular(path).close()
+        provenance = {**recording.provenance, **made_of}
+        replace(recording, recording_id=entry.recording_id, provenance=provenance).save(temporary)
     return Outcome(recording_id=entry.recording_id, note=provenance.get(NOTE))
 
 

@@ -44,8 +44,8 @@ def choose_clips(
         extra = record.metadata.get("extra", {})
         unknown = [name for name in by if name not in extra]
         if unknown:
-            known = ", ".join(sorted(extra)) or "none"
-            raise InputError(f"The clips have no column {', '.join(unknown)}; known: {known}.")
+            columns = ", ".join(sorted(extra)) or "none"
+            raise InputError(f"The clips have no column {', '.join(unknown)}; known: {columns}.")
         key = tuple(extra[name] for name in by) if by else (number,)
         if key not in clips:
             frames, height, width = video_shape(record.arrays)

@@ -24,18 +24,18 @@ SMALL_PX, SAMPLED_PX = 300, 150
 
 def vector_statistics(values: Float[np.ndarray, "n d"]) -> dict[str, np.ndarray]:
     """Return the statistics of an episode's vectors, without NaN; NaN where there is no number."""
-    found = {name: np.full(values.shape[1], np.nan) for name in ("min", "max", "mean", "std")}
-    found |= {name: np.full(values.shape[1], np.nan) for name in QUANTILES}
+    figures = {name: np.full(values.shape[1], np.nan) for name in ("min", "max", "mean", "std")}
+    figures |= {name: np.full(values.shape[1], np.nan) for name in QUANTILES}
     for number, column in enumerate(values.T):
-        known = column[~np.isnan(column)]
-        if len(known):
-            found["min"][number], found["max"][number] = known.min(), known.max()
-            found["mean"][number], found["std"][number] = known.mean(), known.std()
+        numbers = column[~np.isnan(column)]
+        if len(numbers):
+            figures["min"][number], figures["max"][number] = numbers.min(), numbers.max()
+            figures["mean"][number], figures["std"][number] = numbers.mean(), numbers.std()
             for name, value in zip(
-                QUANTILES, np.quantile(known, [*QUANTILES.values()]), strict=True
+                QUANTILES, np.quantile(numbers, [*QUANTILES.values()]), strict=True
             ):
-                found[name][number] = value
-    return {**found, "count": np.array([len(values)])}
+                figures[name][number] = value
+    return {**figures, "count": np.array([len(values)])}
 
 
 def levels(image: UInt8[np.ndarray, "h w 3"]) -> Int[np.ndarray, "3 256"]:
@@ -57,11 +57,11 @@ def image_statistics(images: Sequence[Int[np.ndarray, "3 256"]]) -> dict[str, np
     variance = np.maximum(counts @ values**2 / total - mean**2, 0)
     ranks = np.cumsum(counts, axis=1)
     at = {"min": 0.0, **QUANTILES, "max": 1.0}
-    found = {
+    figures = {
         name: np.array([values[_rank(row, share)] for row in ranks]) for name, share in at.items()
     }
-    found |= {"mean": mean, "std": np.sqrt(variance)}
-    return {name: value.reshape(3, 1, 1) for name, value in found.items()} | {
+    figures |= {"mean": mean, "std": np.sqrt(variance)}
+    return {name: value.reshape(3, 1, 1) for name, value in figures.items()} | {
         "count": np.array([count])
     }
 
@@ -83,13 +83,13 @@ def aggregate(episodes: Sequence[dict[str, np.ndarray]]) -> dict[str, Any]:
         return np.nansum(weights * np.nan_to_num(values), axis=0) / total
 
     center = average(mean)
-    found = {
+    figures = {
         "min": np.fmin.reduce(stacked.pop("min")),
         "max": np.fmax.reduce(stacked.pop("max")),
         "mean": center,
         "std": np.sqrt(average(deviation**2 + (mean - center) ** 2)),
         **{name: average(values) for name, values in stacked.items()},
     }
-    return {name: value.tolist() for name, value in found.items()} | {
+    return {name: value.tolist() for name, value in figures.items()} | {
         "count": counts.sum(axis=0).tolist()
     }

@@ -104,8 +104,11 @@ def write_lerobot(
     names: Sequence[str],
     fps: int,
     robot_type: str,
+    about: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a dataset, complete or absent; `names` are the names of the numbers in a row.
+
+    `about` is added to the description in meta/info.json.
 
     Clips are read from `episodes` and written one by one. Raises `InputError` if there is nothing
     to write, if clips differ in size, if the folder holds files, or without pyarrow.
@@ -123,7 +126,7 @@ def write_lerobot(
             _write_episode(temporary, episode.clips, totals, fps)
         if not totals.episodes:
             raise InputError("There are no episodes: a dataset needs at least one. Record one.")
-        _write_meta(temporary, totals, fps=fps, robot_type=robot_type, names=names)
+        _write_meta(temporary, totals, fps=fps, robot_type=robot_type, names=names, about=about)
 
 
 def _steps(
@@ -232,13 +235,14 @@ def _write_meta(
     fps: int,
     robot_type: str,
     names: Sequence[str],
+    about: Mapping[str, Any] | None,
 ) -> None:
     """Write description, statistics, tasks and files of the episodes."""
     rows = {key: [episode[key] for episode in totals.episodes] for key in totals.episodes[0]}
     _write_table(folder / "meta/episodes/chunk-000/file-000.parquet", rows)
     _write_tasks(folder / "meta/tasks.parquet", totals.tasks)
     frames = totals.frames
-    stats = {key: aggregate(found) for key, found in totals.statistics.items()}
+    stats = {key: aggregate(episodes) for key, episodes in totals.statistics.items()}
     write_json(folder / "meta/stats.json", stats)
     (size,) = totals.sizes
     vector = {"dtype": "float32", "shape": [len(names)], "names": list(names)}
@@ -248,8 +252,9 @@ def _write_meta(
         if name not in (STATE, ACTION)
     }
     image = {"dtype": "image", "shape": [*size, 3], "names": ["height", "width", "channels"]}
-    own = {name: {"dtype": "int64", "shape": [1], "names": None} for name in COUNTERS}
+    counters = {name: {"dtype": "int64", "shape": [1], "names": None} for name in COUNTERS}
     info = {
+        **(about or {}),
         "codebase_version": "v3.0",
         "robot_type": robot_type,
         "total_episodes": len(totals.episodes),
@@ -268,7 +273,7 @@ def _write_meta(
             ACTION: vector,
             **exact,
             "timestamp": {"dtype": "float32", "shape": [1], "names": None},
-            **own,
+            **counters,
         },
     }
     write_json(folder / "meta/info.json", info)

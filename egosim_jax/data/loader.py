@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import logging
 import re
+import signal
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -80,11 +81,13 @@ def make_loader(
     skipped: Counter[str] = Counter()
 
     def open_at(batch: int) -> grain.DatasetIterator:
-        own = grain.MapDataset.range(batch * len(rows), sys.maxsize // batch_size)
-        read = own.map(_Row(examples, rows, batch_size)).to_iter_dataset(_READING)
+        positions_of_rows = grain.MapDataset.range(batch * len(rows), sys.maxsize // batch_size)
+        read = positions_of_rows.map(_Row(examples, rows, batch_size)).to_iter_dataset(_READING)
         if workers:
             flags.FLAGS.mark_as_parsed()
-            read = read.mp_prefetch(grain.MultiprocessingOptions(num_workers=workers))
+            read = read.mp_prefetch(
+                grain.MultiprocessingOptions(num_workers=workers), _outlive_sigterm
+            )
         return iter(read.map(_Count(skipped)).batch(len(rows), drop_remainder=True))
 
     contract = {
@@ -115,8 +118,8 @@ def one_pass(
     examples = _positions(source, 0, shuffle=False).random_map(_Read(source, transform))
     filler = _first_readable(examples, source)
     firsts = range(0, len(source), batch_size)
-    own = [first + row for first in firsts for row in rows if first + row < len(source)]
-    chosen = grain.MapDataset.source(own).map(examples.__getitem__).to_iter_dataset(_READING)
+    in_data = [first + row for first in firsts for row in rows if first + row < len(source)]
+    chosen = grain.MapDataset.source(in_data).map(examples.__getitem__).to_iter_dataset(_READING)
     with closing(iter(chosen)) as stream:
         for _ in firsts:
             read = [next(stream, None) for _ in rows]
@@ -127,6 +130,11 @@ def one_pass(
             batch = {name: np.stack([example[name] for example in kept]) for name in filler}
             weight = [isinstance(example, dict) for example in read]
             yield {**batch, "weight": np.array(weight, np.float32)}
+
+
+def _outlive_sigterm(worker: int, workers: int) -> None:
+    """Ignore SIGTERM, which Slurm sends to worker processes too: the trainer stops them."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
 
 def _checked(rows: Sequence[int] | None, batch_size: int) -> Sequence[int]:
@@ -167,8 +175,8 @@ def _mixed(source: Mixture, seed: int, shuffle: bool) -> grain.MapDataset:
     """Return endless passes over each part, in proportion to their weights."""
     passes, start = [], 0
     for number, part in enumerate(source.parts):
-        own = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
-        positions = grain.MapDataset.range(start, start + len(part)).seed(own)
+        seed_of_part = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
+        positions = grain.MapDataset.range(start, start + len(part)).seed(seed_of_part)
         passes.append((positions.shuffle() if shuffle else positions).repeat())
         start += len(part)
     return grain.MapDataset.mix(passes, list(source.weights))

@@ -78,6 +78,12 @@ class Manifest:
         return sum(shard.records for shard in self.shards)
 
     @property
+    def fps(self) -> int | None:
+        """Frame rate of all clips; None for videos, and if frames were taken at other rates."""
+        rule = self.provenance.get("resampling", "first")
+        return self.spec.fps if self.spec is not None and rule in ("first", "rate") else None
+
+    @property
     def fingerprint(self) -> str:
         """SHA-256 of the hashes of all shards: equal if and only if the records are equal."""
         return hashlib.sha256("".join(shard.sha256 for shard in self.shards).encode()).hexdigest()

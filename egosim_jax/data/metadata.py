@@ -43,13 +43,14 @@ MAX_COLUMNS, MAX_CELLS = 256, 1 << 22
 """Maximum number of columns, and of all cells."""
 
 
-def read_metadata(path: Path, *, prompts: Prompts = "prompts_rewrite") -> list[ClipFiles]:
+def read_metadata(path: Path | str, *, prompts: Prompts = "prompts_rewrite") -> list[ClipFiles]:
     """Read every row of a metadata file (`.csv`, or `.jsonl` with one object per line).
 
     A `.txt` is a DWM list (`data/dwm.py`), for which `prompts` chooses the captions. Raises one
     `InputError` that lists the problems: missing columns, empty cells (which the official loader
     reads as the text "nan"), cells beyond the header, unsafe and duplicate ids.
     """
+    path = Path(path)
     if path.suffix == ".txt":
         return read_list(path, prompts=prompts)
     if prompts != "prompts_rewrite":
@@ -63,9 +64,9 @@ def read_metadata(path: Path, *, prompts: Prompts = "prompts_rewrite") -> list[C
     cells = 0
     for line, read in _json_rows(path) if path.suffix == ".jsonl" else csv_rows(path):
         row = {name: cell.strip() if name in STRIPPED else cell for name, cell in read.items()}
-        found = list(_row_problems(row, first_seen))
-        problems.add(f"line {line}{problem}" for problem in found)
-        if not found:
+        mistakes = list(_row_problems(row, first_seen))
+        problems.add(f"line {line}{problem}" for problem in mistakes)
+        if not mistakes:
             clips.append(_files(path, line, row))
             first_seen[clips[-1].video_id] = line
         cells += len(row)

@@ -18,7 +18,7 @@ from egosim_jax.data.transforms import Resampling, decode_record, video_shape
 from egosim_jax.io.atomic import lock_folder
 from egosim_jax.io.bounded import listing, read_bytes
 from egosim_jax.io.decoding import Decoding
-from egosim_jax.io.video import probe_encoded
+from egosim_jax.io.video import probe_video
 from egosim_jax.types import WAN_GRID, InputError, Triplet, VideoGrid, VideoSpec
 
 MAX_FILE_BYTES = 1 << 28
@@ -36,10 +36,12 @@ def pack(
     decoding: Decoding = "accurate",
     grid: VideoGrid = WAN_GRID,
     resampling: Resampling = "first",
+    fps: int | None = None,
 ) -> Iterator[str | None]:
     """Write clips as shards: frames decoded at `spec`, or source files if that is None.
 
-    Clips must fit the latent `grid`. With a `spec`, `resampling` chooses their frames. After each
+    Clips must fit the latent `grid`, and have the rate `fps`, if it is given, or the one of `spec`,
+    unless `resampling` chooses other frames than the first ones. After each
     clip, yields why it was skipped, or None. Raises `InputError` if all clips were skipped, or if
     another process writes to the same folder.
     """
@@ -71,7 +73,7 @@ def pack(
                         )
                     )
                 else:
-                    record = encoded_record(files, grid)
+                    record = encoded_record(files, grid, fps)
                 writer.add(record.arrays, record.metadata)
             except InputError as error:
                 failed, problem = failed + 1, str(error)
@@ -85,12 +87,12 @@ def clip_metadata(clip: ClipFiles | Triplet) -> dict[str, object]:
     return {"video_id": clip.video_id, "prompt": clip.prompt, "extra": dict(clip.extra)}
 
 
-def encoded_record(files: ClipFiles, grid: VideoGrid = WAN_GRID) -> Record:
+def encoded_record(files: ClipFiles, grid: VideoGrid = WAN_GRID, fps: int | None = None) -> Record:
     """Return a record with the bytes of a clip's files, after the strict checks.
 
     Raises `InputError` listing what `check_clip` finds.
     """
-    problems = check_clip(files, None, grid=grid)
+    problems = check_clip(files, None, grid=grid, fps=fps)
     if problems:
         raise InputError(listing(problems))
     paths = {"prior": files.prior, "hands": files.hands}
@@ -139,21 +141,19 @@ def read_triplets(source: ShardReader) -> Iterator[Triplet]:
 def frame_rates(source: ShardReader, count: int) -> set[Fraction]:
     """Return the frame rates of the first `count` clips in shards; empty if they are unknown.
 
-    Shards of frames know the rate only if the rule `rate` took the frames. Raises `InputError` as
-    `read_triplets` does.
+    Shards of frames know the rate only if the rules `first` or `rate` took the frames. Raises
+    `InputError` as `read_triplets` does.
     """
     _check_targets(source)
     manifest = source.manifest
     if manifest.spec is None:
         return {
-            probe_encoded(
+            probe_video(
                 source[number].arrays["target"].tobytes(), name=f"{source.name(number)}: target"
             ).fps
             for number in range(count)
         }
-    if manifest.provenance.get("resampling", "rate") != "rate":
-        return set()
-    return {Fraction(manifest.spec.fps)}
+    return set() if manifest.fps is None else {Fraction(manifest.fps)}
 
 
 def _check_targets(source: ShardReader) -> None:

@@ -50,5 +50,5 @@ def found_depth(written: Any, folder: Path) -> DepthFiles | None:
     unit = written.get("unit_m") if isinstance(written, dict) else None
     if not isinstance(paths, list) or not isinstance(unit, float):
         raise InputError(f"{DESCRIPTION}: depth is {quote_text(str(written))}.")
-    found = tuple(None if path is None else found_path(path, folder) for path in paths)
-    return DepthFiles(paths=found, unit_m=unit)
+    listed = tuple(None if path is None else found_path(path, folder) for path in paths)
+    return DepthFiles(paths=listed, unit_m=unit)

@@ -40,9 +40,8 @@ from egosim_jax.io.bounded import check_version, quote, quote_path, read_json
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.images import read_depth_image
 from egosim_jax.io.run import write_json
-from egosim_jax.io.segments import read_moments, read_segment
 from egosim_jax.io.untrusted.npz import read_arrays
-from egosim_jax.io.video import Video
+from egosim_jax.io.video import Video, read_moments, read_video
 from egosim_jax.types import (
     HAND_SIZE_M,
     JOINTS,
@@ -194,8 +193,8 @@ class Recording:
             return frame if each is None else each(frame)
 
         if self.times_s is None:
-            first = self.start + start
-            video = read_segment(self.video, start=first, count=stop - start, each=checked)
+            first, end = self.start + start, self.start + stop
+            video = read_video(self.video, start=first, stop=end, whole=True, each=checked)
         else:
             video = read_moments(self.video, self.times_s[start:stop], each=checked)
         return Video(frames=video.frames, fps=self.fps)

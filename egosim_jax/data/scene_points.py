@@ -53,10 +53,10 @@ class ScenePoints:
             value = getattr(self, name)
             if value is None:
                 continue
-            found = f"{getattr(value, 'dtype', type(value).__name__)} {np.shape(value)}"
-            if found != f"{dtype} {shape}" or not np.isfinite(value).all():
+            actual = f"{getattr(value, 'dtype', type(value).__name__)} {np.shape(value)}"
+            if actual != f"{dtype} {shape}" or not np.isfinite(value).all():
                 raise InputError(
-                    f"{name} of the points is {found}: it must be finite {dtype} {shape}."
+                    f"{name} of the points is {actual}: it must be finite {dtype} {shape}."
                 )
         if seen > MAX_POINTS:
             raise InputError(f"{seen:,} observations exceed the maximum, {MAX_POINTS:,}.")

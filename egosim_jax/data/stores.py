@@ -1,28 +1,27 @@
-"""Shards on object stores: `s3://` and `gs://` addresses, copied once to a folder of this machine.
+"""Shards on object stores: addresses such as `s3://BUCKET/FOLDER`, copied once to this machine.
 
 A training reads every record in every epoch, in random order, so one complete copy costs less than
 reads of single records, and the store is asked once. The copy has the layout of the store, and
-readers treat it as any other folder of shards. It is trusted as little:
+readers treat it as any other folder of shards. It is checked like any downloaded folder:
 
     manifest    of limited size, validated and compared with its own hash
-    shards      at most the size in the manifest; the SHA-256 is compared while the file arrives
+    shards      size and SHA-256 are compared with the manifest
     mixtures    their parts must be in the same bucket
     files       renamed to their names when complete; the manifest is written last
 
-The next start asks for the manifest again and copies what changed or is missing. Credentials and
-endpoints are found by fsspec's packages, as other programs find them: environment, files, instance.
+The next start asks for the manifest again and copies what changed or is missing. fsspec's packages
+copy, repeat failed transfers and find credentials and endpoints: environment, files, instance.
 """
 
 from __future__ import annotations
 
-import hashlib
+import errno
 import os
 import re
 import shutil
-import time
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -38,15 +37,8 @@ from egosim_jax.runtime.command import ExitCode, ProcessExit
 from egosim_jax.runtime.progress import track_bytes
 from egosim_jax.types import InputError
 
-PACKAGES = {"s3": "s3fs", "gs": "gcsfs"}
-"""Package of each kind of store, by the scheme of its addresses."""
-TRIES = 4
-"""Maximum number of tries of a transfer."""
-WAIT_S = 1.0
-"""Time before the second try, in seconds; it doubles with each further one."""
-_BLOCK = 16 << 20
 _TRANSFERS = 8
-_ADDRESS = re.compile(r"(s3|gs)://([A-Za-z0-9][A-Za-z0-9._-]*)((?:/[^/?#*\[\]\\]+)*)/*")
+_ADDRESS = re.compile(r"([a-z][a-z0-9]*)://([A-Za-z0-9][A-Za-z0-9._-]*)((?:/[^/?#*\[\]\\]+)*)/*")
 
 
 def local_shards(
@@ -57,7 +49,7 @@ def local_shards(
     Missing shards are copied there. `cache` is by default in the user's cache folder, and holds at
     most `limit` bytes. One process at a time copies to it; the others wait, and find the copy.
     Raises `InputError` if the store refuses, or holds no valid shards or more than fits, and
-    `ProcessExit` if transfers fail repeatedly.
+    `ProcessExit` if a transfer fails.
     """
     if isinstance(shards, Path) or "://" not in shards:
         return Path(shards)
@@ -70,7 +62,7 @@ def local_shards(
         )
     root = cache or cache_folder() / "shards"
     bucket = f"{match[1]}://{match[2]}"
-    copy = _Copy(_Store(match[1]), bucket, root / match[1] / match[2], root, limit)
+    copy = _Copy(_files(match[1]), bucket, root / match[1] / match[2], root, limit)
     folder = copy.place.joinpath(*parts)
     with ExitStack() as stack:
         try:
@@ -81,43 +73,25 @@ def local_shards(
     return folder
 
 
-class _Store:
-    """The objects of a kind of store."""
+def _files(scheme: str) -> Any:
+    """Return fsspec's file system of addresses with a scheme, such as `s3`."""
+    try:
+        import fsspec
 
-    def __init__(self, scheme: str):
-        try:
-            import fsspec
-
-            self._files: Any = fsspec.filesystem(scheme, skip_instance_cache=True)
-        except ImportError as error:
-            raise InputError(
-                f"Addresses {scheme}://... need {PACKAGES[scheme]}, which is not installed: pip "
-                "install 'egosim-jax[stores]'. (--latents, --validation)"
-            ) from error
-
-    def read(self, address: str, start: int, end: int) -> bytes:
-        """Return bytes of an object, which may end before. Repeats failed transfers.
-
-        Raises `FileNotFoundError`, `PermissionError`, or `ConnectionError` after the last try.
-        """
-        failure: Exception | None = None
-        for attempt in range(TRIES):
-            if attempt:
-                time.sleep(WAIT_S * 2 ** (attempt - 1))
-            try:
-                return self._files.cat_file(address, start=start, end=end)
-            except (FileNotFoundError, PermissionError):
-                raise
-            except Exception as error:  # each store has its own
-                failure = error
-        raise ConnectionError(f"{type(failure).__name__}: {failure}") from failure
+        return fsspec.filesystem(scheme, skip_instance_cache=True)
+    except (ImportError, ValueError) as error:
+        raise InputError(
+            f"Addresses {scheme}://... cannot be read: {quote_text(str(error))}. For s3 and gs: "
+            "pip install 'egosim-jax[stores]'. (--latents, --validation)"
+        ) from error
 
 
 @dataclass(frozen=True)
 class _Copy:
     """The copy of a bucket in a cache."""
 
-    store: _Store
+    files: Any
+    """File system of fsspec."""
     bucket: str
     """Address of the bucket."""
     place: Path
@@ -139,7 +113,7 @@ class _Copy:
                 "(--latents, --validation)"
             )
         (folder / MANIFEST).unlink(missing_ok=True)  # of shards that were here before
-        _write(folder / MIXTURE, [data])
+        _write(folder / MIXTURE, data)
         for part in read_mixture(folder):
             inside = Path(os.path.normpath(part))
             if not inside.is_relative_to(self.place):
@@ -172,7 +146,7 @@ class _Copy:
         for path in folder.glob("shard-*.array_record"):
             if path.name not in names:
                 path.unlink()
-        _write(folder / MANIFEST, [data])
+        _write(folder / MANIFEST, data)
 
     def _missing(self, folder: Path, manifest: Manifest, data: bytes) -> Iterator[ShardInfo]:
         """Yield the shards that the copy lacks. Hashes files unless it was complete before."""
@@ -199,60 +173,43 @@ class _Copy:
 
     def _fetch(self, folder: Path, shard: ShardInfo) -> int:
         """Copy a shard and return its size. Raises `InputError` if it differs from the manifest."""
-        path, digest = folder / shard.file, hashlib.sha256()
+        path = folder / shard.file
         name = self._address(path)
-
-        def blocks() -> Iterator[bytes]:
-            for start in range(0, shard.size, _BLOCK):
-                data = self._block(name, start, min(start + _BLOCK, shard.size))
-                digest.update(data)
-                yield data
-            if digest.hexdigest() != shard.sha256:
-                raise InputError(
-                    f"{name} differs from its manifest: the SHA-256 of its first {shard.size:,} "
-                    f"bytes is {digest.hexdigest()[:16]}, expected {quote_text(shard.sha256[:16])}."
-                    " Copy the whole folder to the store again."
-                )
-
-        _write(path, blocks())
-        return shard.size
-
-    def _block(self, name: str, start: int, end: int) -> bytes:
-        """Return bytes of a shard."""
         try:
-            return self.store.read(name, start, end)
+            with _asking(name), atomic_write(path) as temporary:
+                size = self.files.size(name)
+                if size == shard.size:
+                    self.files.get_file(name, str(temporary))
+                if size != shard.size or sha256(temporary) != shard.sha256:
+                    raise InputError(
+                        f"{name} differs from its manifest, in size ({quote(size)} of "
+                        f"{shard.size:,} bytes) or SHA-256. Copy the whole folder to the store "
+                        "again."
+                    )
         except FileNotFoundError as error:
             raise InputError(
                 f"{name} is missing, although its manifest names it. Copy the whole folder to the "
                 "store again."
             ) from error
-        except PermissionError as error:
-            raise InputError(_no_access(name, error)) from error
         except ConnectionError as error:
             raise ProcessExit(
-                f"{name} could not be copied in {TRIES} tries: {quote_text(str(error))}. Run the "
-                "same command again: complete shards are kept.",
+                f"{error} Run the same command again: complete shards are kept.",
                 ExitCode.RESUBMIT,
             ) from error
+        return shard.size
 
     def _document(self, path: Path) -> bytes | None:
         """Return the JSON document that belongs at a path; None if the store lacks it."""
         name = self._address(path)
         try:
-            return self.store.read(name, 0, MAX_JSON_BYTES + 1)
-        except FileNotFoundError as error:
-            if "bucket" in str(error).lower():
-                raise InputError(
-                    f"There is no bucket {self.bucket}: check its name, and the endpoint if it is "
-                    "not the provider's own. (--latents, --validation)"
-                ) from error
+            with _asking(name):
+                return self.files.cat_file(name, start=0, end=MAX_JSON_BYTES + 1)
+        except FileNotFoundError:
             return None
-        except PermissionError as error:
-            raise InputError(_no_access(name, error)) from error
         except ConnectionError as error:
             raise InputError(
-                f"{name} cannot be read: {quote_text(str(error))}. Check the network, the endpoint "
-                "and the credentials. (--latents, --validation)"
+                f"{error} Check the network, the endpoint and the credentials. "
+                "(--latents, --validation)"
             ) from error
 
     def _address(self, path: Path) -> str:
@@ -261,14 +218,29 @@ class _Copy:
         return self.bucket if inner == "." else f"{self.bucket}/{inner}"
 
 
-def _no_access(name: str, error: OSError) -> str:
-    return (
-        f"{name} may not be read: {quote_text(str(error))}. Give this machine credentials that may "
-        "read the bucket: aws configure or AWS_PROFILE for s3, gcloud auth application-default "
-        "login for gs."
-    )
+@contextmanager
+def _asking(name: str) -> Iterator[None]:
+    """Turn the errors of a store into `InputError` if it refuses, else `ConnectionError`.
+
+    Raises `FileNotFoundError` and errors of this machine's disk as they are.
+    """
+    try:
+        yield
+    except (InputError, FileNotFoundError):
+        raise
+    except PermissionError as error:
+        raise InputError(
+            f"{name} may not be read: {quote_text(str(error))}. Give this machine credentials that "
+            "may read the bucket: aws configure or AWS_PROFILE for s3, gcloud auth "
+            "application-default login for gs."
+        ) from error
+    except Exception as error:  # each store has its own
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        reason = quote_text(f"{type(error).__name__}: {error}")
+        raise ConnectionError(f"{name} cannot be read: {reason}.") from error
 
 
-def _write(path: Path, blocks: Iterable[bytes]) -> None:
-    with atomic_write(path) as temporary, temporary.open("wb") as file:
-        file.writelines(blocks)
+def _write(path: Path, data: bytes) -> None:
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(data)

@@ -7,8 +7,10 @@ stay unchanged.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Any, Literal
 
 import grain
@@ -18,10 +20,11 @@ from PIL import Image
 
 from egosim_jax.io.decoding import Decoding
 from egosim_jax.io.images import decode_image
-from egosim_jax.io.video import decode_video, probe_encoded
+from egosim_jax.io.timing import MAX_RATE_RATIO
+from egosim_jax.io.video import probe_video, read_video
 from egosim_jax.types import InputError, VideoSpec
 
-Resampling = Literal["first", "stride", "linspace", "rate"]
+Resampling = Literal["first", "stride", "linspace", "rate", "step"]
 """Rule that chooses the frames of a clip (`resample`)."""
 COLORS = ("target", "prior", "hands")
 """Names of the color videos of a record."""
@@ -48,24 +51,55 @@ def resize_mask(
     return _resize_all(mask, height, width, Image.Resampling.BILINEAR)
 
 
-def resample(count: int, frames: int, rule: Resampling, *, step: int = 1) -> Int[np.ndarray, " n"]:
+def resample(
+    count: int, frames: int, rule: Resampling, *, ratio: Fraction = Fraction(1)
+) -> Int[np.ndarray, " n"]:
     """Return the indices of at most `frames` frames to take from a clip of `count`.
+
+    `ratio` is the clip's frame rate divided by the model's.
 
     first      the first ones, without gaps
     stride     every (count // frames)-th from the first, as DWM's video loader does
     linspace   from the first to the last, equally spaced and rounded, as DWM's latent encoder does;
                a clip that is too short repeats frames
-    rate       every `step`-th from the first, as in the evaluation behind DWM's tables, whose step
-               is the clip's frame rate divided by 8, rounded down
+    rate       the nearest in time to the model's frames
+    step       every n-th from the first, where n is `ratio` rounded down, as in the evaluation
+               behind DWM's tables
     """
     match rule:
         case "linspace":
             return np.rint(np.linspace(0, count - 1, frames)).astype(int)
-        case "stride":
-            step = max(1, count // frames)
+        case "rate":
+            taken = [math.floor(number * ratio + Fraction(1, 2)) for number in range(frames)]
+            return np.array([index for index in taken if index < count], int)
         case "first":
             step = 1
+        case "stride":
+            step = count // frames
+        case "step":
+            step = int(ratio)
     return np.arange(0, count, max(1, step))[:frames]
+
+
+def rate_problem(fps: Fraction, model_fps: int) -> str | None:
+    """Say how a clip's frame rate contradicts its model's; None if they agree within 1 %."""
+    ratio = fps / model_fps
+    if max(ratio, 1 / ratio) <= MAX_RATE_RATIO:
+        return None
+    return (
+        f"{float(fps):g} frames a second are not the model's {model_fps}: everything would move "
+        f"{float(1 / ratio):.3g} times as fast."
+    )
+
+
+def check_rates(fps: Fraction, model_fps: int, *, source: str = "The clip") -> None:
+    """Raise `InputError` if the frame rate of packed clips is not the model's."""
+    if problem := rate_problem(fps, model_fps):
+        raise InputError(
+            f"{source} cannot be used: {problem} Pack the clips again with frames nearest in time: "
+            f"`egosim data pack --size HEIGHT WIDTH --resampling rate --fps {model_fps}`. "
+            "(--shards)"
+        )
 
 
 def fit_length(frames: UInt8[np.ndarray, "f ..."], count: int) -> UInt8[np.ndarray, "g ..."]:
@@ -119,7 +153,7 @@ def video_shape(arrays: Mapping[str, np.ndarray]) -> tuple[int, int, int]:
         raise InputError("The record is not a clip: prior is missing.")
     if prior.ndim > 1:
         return prior.shape[0], prior.shape[1], prior.shape[2]
-    info = probe_encoded(prior.tobytes(), name="prior")
+    info = probe_video(prior.tobytes(), name="prior")
     return info.frames, info.height, info.width
 
 
@@ -129,12 +163,14 @@ def decode_record(
     *,
     start: int = 0,
     decoding: Decoding = "accurate",
+    check_rate: bool = False,
 ) -> dict[str, np.ndarray]:
     """Return frames `[start, start + spec.frames)` of a record's videos, at the size of `spec`.
 
     Without a mask, every pixel is observed. Raises `InputError` naming the video that cannot be
-    decoded or is too short.
+    decoded, is too short or, with `check_rate`, has another frame rate.
     """
+    fps = spec.fps if check_rate else None
     stop = start + spec.frames
     decoded: dict[str, np.ndarray] = {}
     absent = [name for name in ("prior", "hands", "first_frame") if name not in arrays]
@@ -143,7 +179,7 @@ def decode_record(
     for name in (*COLORS, "mask"):
         if name not in arrays:
             continue
-        frames = _frames(arrays[name], name, start, stop, decoding)
+        frames = _frames(arrays[name], name, start, stop, decoding, fps)
         if len(frames) < spec.frames:
             raise InputError(f"{name} ends before frame {stop}.")
         if name == "mask":
@@ -159,12 +195,15 @@ def decode_record(
     return decoded
 
 
-def _frames(array: np.ndarray, name: str, start: int, stop: int, decoding: Decoding) -> np.ndarray:
+def _frames(
+    array: np.ndarray, name: str, start: int, stop: int, decoding: Decoding, fps: int | None
+) -> np.ndarray:
     if array.ndim > 1:
         return array[start:stop]
-    return decode_video(
-        array.tobytes(), start=start, stop=stop, decoding=decoding, name=name
-    ).frames
+    video = read_video(array.tobytes(), start=start, stop=stop, decoding=decoding, name=name)
+    if fps is not None:
+        check_rates(video.fps, fps)
+    return video.frames
 
 
 def _resize_all(frames: np.ndarray, height: int, width: int, how: Image.Resampling) -> np.ndarray:

@@ -85,5 +85,5 @@ def conditions_sha256(files: ClipFiles) -> str:
         "hands": files.hands,
         "first_frame": files.first_frame,
     }
-    found = {role: sha256(path) for role, path in roles.items() if path and path.exists()}
-    return hashlib.sha256(json.dumps(found).encode()).hexdigest()
+    hashes = {role: sha256(path) for role, path in roles.items() if path and path.exists()}
+    return hashlib.sha256(json.dumps(hashes).encode()).hexdigest()

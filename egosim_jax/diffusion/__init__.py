@@ -4,11 +4,14 @@ Pure functions of arrays and a predicting function belong here. Networks do not.
 
     RectifiedFlow, VariancePreserving       processes
     Euler, DDIM, UniPC, DPMSolver           solvers
+    SOLVERS                                 solvers by name, also of other packages
     integrate                               the sampling loop, one scan
+    StepCache                               steps that reuse predictions
     Guidance                                classifier-free guidance
     Objective                               training loss at random noise levels
 """
 
+from egosim_jax.diffusion.caching import StepCache
 from egosim_jax.diffusion.dpm import DPMSolver
 from egosim_jax.diffusion.guidance import Guidance
 from egosim_jax.diffusion.objective import Objective
@@ -19,11 +22,12 @@ from egosim_jax.diffusion.process import (
     RectifiedFlow,
     VariancePreserving,
 )
-from egosim_jax.diffusion.solver import DDIM, Euler, Solver, integrate
+from egosim_jax.diffusion.solver import DDIM, SOLVERS, Euler, Solver, integrate
 from egosim_jax.diffusion.unipc import UniPC
 
 __all__ = [
     "DDIM",
+    "SOLVERS",
     "DPMSolver",
     "DenoiseFn",
     "Euler",
@@ -33,6 +37,7 @@ __all__ = [
     "Process",
     "RectifiedFlow",
     "Solver",
+    "StepCache",
     "UniPC",
     "VariancePreserving",
     "integrate",

@@ -95,3 +95,7 @@ class DPMSolver:
         data = process.to_x0(state.x, at_least_float32(output), row.alpha, row.sigma)
         x = row.keep * state.x + row.data * data + row.before * state.before
         return DPMSolverState(x if keys is None else x + row.noise * sample_noise(keys, x), data)
+
+
+SDE = DPMSolver(stochastic=True)
+"""DPM-Solver++ (2M SDE)."""

@@ -32,7 +32,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from egosim_jax.diffusion.caching import StepCache
 from egosim_jax.diffusion.process import DenoiseFn, Process, at_least_float32
+from egosim_jax.runtime.registry import Registry
 from egosim_jax.types import InputError
 
 Kept = TypeVar("Kept")
@@ -74,6 +76,22 @@ class Solver(Protocol):
         ...
 
 
+SOLVERS: Registry[Solver] = Registry(
+    "solver",
+    "--solver",
+    "egosim_jax.solvers",
+    {
+        "euler": "egosim_jax.diffusion:Euler",
+        "unipc": "egosim_jax.diffusion:UniPC",
+        "wan": "egosim_jax.diffusion:UniPC",
+        "ddim": "egosim_jax.diffusion:DDIM",
+        "dpmpp_2m": "egosim_jax.diffusion:DPMSolver",
+        "dpmpp_2m_sde": "egosim_jax.diffusion.dpm:SDE",
+    },
+)
+"""Solvers by name; `wan` also changes the process (`RectifiedFlow.wan_unipc`)."""
+
+
 def sample_noise(keys: Key[Array, " b"], x: Float[Array, "*x"]) -> Float[Array, "*x"]:
     """Draw the noise of a step, each sample's from its own key."""
     return jax.vmap(lambda key: jax.random.normal(key, x.shape[1:]))(keys)
@@ -88,19 +106,30 @@ def integrate(
     steps: SupportsIndex | Sequence[int | float],
     keys: Key[Array, " b"] | None = None,
     count: int | None = None,
+    cache: StepCache | None = None,
 ) -> Float[Array, "b f h w c"]:
     """Turn noise into latents, one network evaluation a step: one scan, no host round trips.
 
     `steps` is the number of steps, or the timesteps to visit. `keys`, one for each sample, draw the
     noise of a stochastic solver; step i uses `fold_in(key, i)`. With `count`, only so many of the
-    steps are taken.
+    steps are taken. With a `cache`, steps reuse predictions.
     """
-
-    def advance(state: Any, row: tuple) -> tuple[Any, None]:
-        return _advance(lambda x, t: (denoise(x, t), None), process, solver, state, row)
-
     rows = jax.tree.map(lambda row: row[:count], _rows(process, solver, steps, keys))
-    return jax.lax.scan(advance, solver.start(noise), rows)[0].x
+    if cache is None:
+
+        def advance(state: Any, row: tuple) -> tuple[Any, None]:
+            return _advance(lambda x, t: (denoise(x, t), None), process, solver, state, row)
+
+        return jax.lax.scan(advance, solver.start(noise), rows)[0].x
+
+    def advance_reusing(carry: Any, row: tuple) -> tuple[Any, None]:
+        (state, memory), (due, row) = carry, row
+        predict = lambda x, t: cache.predict(denoise, memory, x, t, due)  # noqa: E731
+        return _advance(predict, process, solver, state, row), None
+
+    start = solver.start(noise), cache.start(noise)
+    rows = cache.due(len(rows[0])), rows
+    return jax.lax.scan(advance_reusing, start, rows)[0][0].x
 
 
 def integrate_keeping(

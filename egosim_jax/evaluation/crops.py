@@ -37,27 +37,27 @@ def find_crops(
     Without `every`, images of the ground truth's size show all of it. Returns the crops in words.
     """
     groups: dict[tuple[str, int, int, int, int], list[tuple[Window, Path]]] = {}
-    for window, own in lengths.items():
+    for window, info in lengths.items():
         path = window.files.target
         if path is None or not path.exists():
             continue
         truth = probe_video(path)
-        blank = np.broadcast_to(np.uint8(0), (own.height, own.width))
+        blank = np.broadcast_to(np.uint8(0), (info.height, info.width))
         size = without_border(blank, truth.height, truth.width).shape
         if every or size != (truth.height, truth.width):
             key = (window.files.extra.get("dataset", ""), *size, truth.height, truth.width)
             groups.setdefault(key, []).append((window, path))
     lines = []
     for (dataset, _, _, height, width), clips in groups.items():
-        found = _find(folder, clips[:CLIPS], lengths, cache)
-        folder.crops.update({window.output_id: found.crop for window, _ in clips})
-        evidence = f"correlation {found.correlation:.3f}, {len(clips[:CLIPS])} clips"
-        if not found.found:
+        result = _find(folder, clips[:CLIPS], lengths, cache)
+        folder.crops.update({window.output_id: result.crop for window, _ in clips})
+        evidence = f"correlation {result.correlation:.3f}, {len(clips[:CLIPS])} clips"
+        if not result.found:
             text = "no crop was found; the images are stretched to the whole"
-        elif found.crop == WHOLE:
+        elif result.crop == WHOLE:
             text = "the whole image"
         else:
-            edges = found.crop.pixels(height, width)
+            edges = result.crop.pixels(height, width)
             left, top, right, bottom = (f"{edge + 0:.1f}" for edge in np.round(edges, 1))
             text = f"columns {left} to {right}, rows {top} to {bottom} of {width}x{height}"
         name = f"{folder.name}, {dataset}" if dataset else folder.name
@@ -74,16 +74,16 @@ def _find(
     """Return the crop of some clips, cached or computed."""
     content = [[sha256(folder.file(w)), sha256(path), w.start] for w, path in clips]
     key = fingerprint(["crop", VERSION, content])
-    known = cache.get(key)
-    if known is None:
+    cached = cache.get(key)
+    if cached is None:
         found = find_crop(
             [_pair(folder.file(w), path, w.start, lengths[w].frames) for w, path in clips]
         )
-        known = {**found.crop._asdict(), "correlation": found.correlation}
-        cache.put(key, {**known, "found": float(found.found)})
+        cached = {**found.crop._asdict(), "correlation": found.correlation}
+        cache.put(key, {**cached, "found": float(found.found)})
         return found
-    crop = Edges(*(known[name] for name in Edges._fields))
-    return Found(crop, known["correlation"], bool(known["found"]))
+    crop = Edges(*(cached[name] for name in Edges._fields))
+    return Found(crop, cached["correlation"], bool(cached["found"]))
 
 
 def _pair(video: Path, truth: Path, start: int, count: int) -> Pair:

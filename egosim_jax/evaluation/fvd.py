@@ -12,58 +12,38 @@ few clips. It is still biased upward for small sets.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from egosim_jax.data.windows import Window
-from egosim_jax.evaluation.measures import Column, GroundTruth, Scorer
+from egosim_jax.evaluation.measures import Column, GroundTruth, Measure, Scorer
 from egosim_jax.perception.networks.video_mae import VideoMae
 
-COLUMN = Column("FVD (VideoMAE)", "{:.2f}", "lower")
-DEFINITION = (
+COLUMN = Column(
+    "FVD (VideoMAE)",
+    "{:.2f}",
+    "lower",
     "Fréchet distance between the features of a group's videos and of their ground truth by the "
-    "given VideoMAE: not comparable with the I3D of other papers, and biased upward for few clips"
+    "given VideoMAE: not comparable with the I3D of other papers, and biased upward for few clips",
 )
 _VIDEO, _TARGET = "fvd_video", "fvd_target"
 
 
-@dataclass(frozen=True, eq=False)
-class Features:
-    """Features of each video and its ground truth, from which `fvd` is computed per group."""
+def features(network: VideoMae) -> Measure:
+    """Return the features of each video and its ground truth: `distance_of` has their distance."""
 
-    network: VideoMae
-    """Feature network."""
+    def against(truth: GroundTruth) -> Scorer:
+        target = network(truth.counted)
+        return lambda video: {
+            f"{name}.{place}": float(value)
+            for name, vector in ((_VIDEO, network(video[truth.first :])), (_TARGET, target))
+            for place, value in enumerate(vector)
+        }
 
-    @property
-    def columns(self) -> Mapping[str, Column]:
-        """Headings by key."""
-        return {"fvd": COLUMN}
-
-    @property
-    def definitions(self) -> Mapping[str, str]:
-        """Definitions by key."""
-        return {"fvd": DEFINITION}
-
-    def settings(self, window: Window) -> Any:
-        """Return the network, whose fingerprint is the hash of its files."""
-        return self.network
-
-    def against(self, truth: GroundTruth) -> Scorer:
-        """Return a function that computes the features of both videos."""
-        target = self.network(truth.counted)
-
-        def score(video: np.ndarray) -> Mapping[str, float]:
-            found = self.network(video[truth.first :])
-            return {
-                f"{name}.{place}": float(value)
-                for name, vector in ((_VIDEO, found), (_TARGET, target))
-                for place, value in enumerate(vector)
-            }
-
-        return score
+    # The fingerprint of the network is the hash of its files.
+    return Measure(
+        name="Features", columns={"fvd": COLUMN}, against=against, settings=lambda _: network
+    )
 
 
 def is_feature(key: str) -> bool:
@@ -73,11 +53,11 @@ def is_feature(key: str) -> bool:
 
 def distance_of(scores: list[Mapping[str, float]]) -> float | None:
     """Return the FVD of a method's clips from their features; None without features."""
-    found = [_vector(one, _VIDEO) for one in scores]
+    videos = [_vector(one, _VIDEO) for one in scores]
     targets = [_vector(one, _TARGET) for one in scores]
-    if not found or not all(len(vector) for vector in found):
+    if not videos or not all(len(vector) for vector in videos):
         return None
-    return frechet_distance(np.stack(found), np.stack(targets))
+    return frechet_distance(np.stack(videos), np.stack(targets))
 
 
 def frechet_distance(a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "m d"]) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
@@ -15,17 +15,19 @@ from egosim_jax.evaluation.metrics.dreamsim import DEFINITION, DreamSim
 from egosim_jax.evaluation.metrics.image import clip_psnr, color_drift, psnr, ssim
 from egosim_jax.evaluation.metrics.report import DEFINITIONS
 from egosim_jax.evaluation.registration import WHOLE, Edges
+from egosim_jax.runtime.registry import Registry
 
 VERSION = 1
 """Version of all measures; a change invalidates cached scores."""
 
 
 class Column(NamedTuple):
-    """Heading, number format and direction of a measure."""
+    """Heading, number format, direction and definition of a measure."""
 
     heading: str
     form: str
     better: Literal["higher", "lower"]
+    definition: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,60 +53,33 @@ Scorer = Callable[[np.ndarray], Mapping[str, float]]
 """Function from a video, as long as the ground truth, to its values by key."""
 
 
-@runtime_checkable
-class Measure(Protocol):
+def _no_settings(_window: Window) -> None:
+    """Return None: the values depend only on both videos."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measure:
     """Columns of a table that are computed together."""
 
-    @property
-    def columns(self) -> Mapping[str, Column]:
-        """Headings by key."""
-        ...
-
-    @property
-    def definitions(self) -> Mapping[str, str]:
-        """Definitions by key or keys."""
-        ...
-
-    def settings(self, window: Window) -> Any:
-        """Return other inputs of the values, such as hashes of weights, for the cache key."""
-        ...
-
-    def against(self, truth: GroundTruth) -> Scorer:
-        """Return a scorer for this ground truth, which is processed only once."""
-        ...
+    name: str
+    """Name of the measure, for the cache of scores."""
+    columns: Mapping[str, Column]
+    """Columns by key."""
+    against: Callable[[GroundTruth], Scorer]
+    """Function that makes a scorer for a ground truth, which is processed only once."""
+    settings: Callable[[Window], Any] = _no_settings
+    """Function that returns other inputs of the values, such as hashes of weights, for the cache.
+    """
 
 
-@dataclass(frozen=True)
-class Pixels:
-    """PSNR in both papers' definitions, SSIM and color drift."""
+METRICS: Registry[Measure] = Registry("metric", "--metrics", "egosim_jax.metrics")
+"""Measures of other packages, by name; each of our measures has its option."""
 
-    @property
-    def columns(self) -> Mapping[str, Column]:
-        """Headings by key."""
-        return {
-            "psnr": Column("PSNR dB", "{:.2f}", "higher"),
-            "ssim": Column("SSIM", "{:.4f}", "higher"),
-            "psnr_clip": Column("PSNR of the clip dB", "{:.2f}", "higher"),
-            "color_drift": Column("color drift", "{:.2f}", "lower"),
-        }
 
-    @property
-    def definitions(self) -> Mapping[str, str]:
-        """Definitions by key."""
-        return {
-            **{key: DEFINITIONS[key] for key in ("psnr", "ssim")},
-            "psnr_clip": "dB; one mean squared error over all frames, pixels and channels of a "
-            "clip, as torchmetrics computes PSNR and DWM reports it",
-            "color_drift": "levels of 255; |mean RGB of the last frame - mean RGB of the ground "
-            "truth there|, mean over channels",
-        }
+def pixels() -> Measure:
+    """Return PSNR in both papers' definitions, SSIM and color drift."""
 
-    def settings(self, window: Window) -> Any:
-        """Return None: the values depend only on both videos."""
-
-    def against(self, truth: GroundTruth) -> Scorer:
-        """Return a function that computes all four measures."""
-
+    def against(truth: GroundTruth) -> Scorer:
         def score(video: np.ndarray) -> Mapping[str, float]:
             pair = video[truth.first :], truth.counted
             frames = psnr(*pair)
@@ -118,75 +93,67 @@ class Pixels:
 
         return score
 
-
-@dataclass(frozen=True, eq=False)
-class LpipsDistance:
-    """LPIPS of one network."""
-
-    network: lpips.Lpips
-    """Loaded network."""
-    name: Literal["alex", "vgg"] = "alex"
-    """Name of the network."""
-
-    @property
-    def columns(self) -> Mapping[str, Column]:
-        """Heading of the network's column."""
-        heading = {"alex": "LPIPS-Alex", "vgg": "LPIPS-VGG"}[self.name]
-        return {f"lpips_{self.name}": Column(heading, "{:.4f}", "lower")}
-
-    @property
-    def definitions(self) -> Mapping[str, str]:
-        """Definition of the network's column."""
-        return {f"lpips_{self.name}": lpips.definition(self.name)}
-
-    def settings(self, window: Window) -> Any:
-        """Return the config, which includes the hash of the weights."""
-        return self.network.config
-
-    def against(self, truth: GroundTruth) -> Scorer:
-        """Return a function that computes the mean distance over frames."""
-        reference = lpips.Reference(self.network, truth.counted)
-        return lambda video: {
-            f"lpips_{self.name}": float(reference.distances(video[truth.first :]).mean())
-        }
+    columns = {
+        "psnr": Column("PSNR dB", "{:.2f}", "higher", DEFINITIONS["psnr"]),
+        "ssim": Column("SSIM", "{:.4f}", "higher", DEFINITIONS["ssim"]),
+        "psnr_clip": Column(
+            "PSNR of the clip dB",
+            "{:.2f}",
+            "higher",
+            "dB; one mean squared error over all frames, pixels and channels of a clip, as "
+            "torchmetrics computes PSNR and DWM reports it",
+        ),
+        "color_drift": Column(
+            "color drift",
+            "{:.2f}",
+            "lower",
+            "levels of 255; |mean RGB of the last frame - mean RGB of the ground truth there|, "
+            "mean over channels",
+        ),
+    }
+    return Measure(name="Pixels", columns=columns, against=against)
 
 
-@dataclass(frozen=True, eq=False)
-class DreamSimDistance:
-    """DreamSim distance."""
+def lpips_distance(network: lpips.Lpips, name: Literal["alex", "vgg"] = "alex") -> Measure:
+    """Return the mean LPIPS of one network over frames."""
+    key, heading = f"lpips_{name}", {"alex": "LPIPS-Alex", "vgg": "LPIPS-VGG"}[name]
 
-    network: DreamSim
-    """Loaded network."""
+    def against(truth: GroundTruth) -> Scorer:
+        reference = lpips.Reference(network, truth.counted)
+        return lambda video: {key: float(reference.distances(video[truth.first :]).mean())}
 
-    @property
-    def columns(self) -> Mapping[str, Column]:
-        """Heading of the column."""
-        return {"dreamsim": Column("DreamSim", "{:.4f}", "lower")}
+    return Measure(
+        name="LpipsDistance",
+        columns={key: Column(heading, "{:.4f}", "lower", lpips.definition(name))},
+        against=against,
+        settings=lambda _: network.config,  # has the hash of the weights
+    )
 
-    @property
-    def definitions(self) -> Mapping[str, str]:
-        """Definition of the column."""
-        return {"dreamsim": DEFINITION.format(self.network.size)}
 
-    def settings(self, window: Window) -> Any:
-        """Return the hashes of the weights."""
-        return self.network.hashes
+def dreamsim_distance(network: DreamSim) -> Measure:
+    """Return the mean DreamSim distance over frames."""
 
-    def against(self, truth: GroundTruth) -> Scorer:
-        """Return a function that computes the mean distance over frames."""
-        reference = self.network.embed(truth.counted)
+    def against(truth: GroundTruth) -> Scorer:
+        reference = network.embed(truth.counted)
 
         def score(video: np.ndarray) -> Mapping[str, float]:
-            found = self.network.embed(video[truth.first :])
-            return {"dreamsim": float(self.network.distances(found, reference).mean())}
+            embedded = network.embed(video[truth.first :])
+            return {"dreamsim": float(network.distances(embedded, reference).mean())}
 
         return score
+
+    return Measure(
+        name="DreamSimDistance",
+        columns={"dreamsim": Column("DreamSim", "{:.4f}", "lower", DEFINITION)},
+        against=against,
+        settings=lambda _: network.hashes,
+    )
 
 
 def standard() -> Sequence[Measure]:
     """Return the default measures: pixels and, if its package is installed, LPIPS (AlexNet)."""
     alex = lpips.load_if_installed("alex")
-    return [Pixels()] if alex is None else [Pixels(), LpipsDistance(alex)]
+    return [pixels()] if alex is None else [pixels(), lpips_distance(alex)]
 
 
 def columns_of(measures: Sequence[Measure]) -> dict[str, Column]:

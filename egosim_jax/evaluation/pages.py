@@ -26,7 +26,8 @@ from egosim_jax.evaluation.metrics.report import cell_of
 from egosim_jax.evaluation.result import Evaluation
 from egosim_jax.evaluation.scoring import row_of
 from egosim_jax.io.run import write_text
-from egosim_jax.io.video import encode_video, probe_video
+from egosim_jax.io.video import probe_video
+from egosim_jax.io.writing import encode_video
 from egosim_jax.runtime.progress import track
 from egosim_jax.types import InputError
 

@@ -103,9 +103,9 @@ def find_crop(pairs: Sequence[Pair]) -> Found:
     if slack <= MAX_SLACK_PX or gain.mean() < MIN_GAIN or np.median(gain) <= 0:
         crop = whole
     correlation = float(np.sqrt(1 - np.exp(-np.median(_evidence(crop, couples)))))
-    found = correlation >= MIN_CORRELATION
+    is_found = correlation >= MIN_CORRELATION
     shares = Edges(*np.divide(crop, (width, height) * 2).tolist())
-    return Found(shares if found and crop is not whole else WHOLE, correlation, found)
+    return Found(shares if is_found and crop is not whole else WHOLE, correlation, is_found)
 
 
 def _search(pairs: Sequence[Pair]) -> Edges:
@@ -121,7 +121,7 @@ def _search(pairs: Sequence[Pair]) -> Edges:
         for one, place in [*zip(video, places(len(video), len(true)), strict=True)][::_EVERY]
     ]
     square = rows * wide / (columns * high)  # height of a crop by its width, as shares
-    best, found = -np.inf, WHOLE.pixels(height, width)
+    best, best_crop = -np.inf, WHOLE.pixels(height, width)
     for share in np.geomspace(_MIN_SHARE, 1.1 * max(1.0, 1 / square), 28):
         for ratio in [*np.linspace(0.92, 1.08, 5) * square, 0.97, 1.0, 1.03]:
             size = round(share * wide), round(share * ratio * high)
@@ -139,9 +139,9 @@ def _search(pairs: Sequence[Pair]) -> Edges:
             if (value := np.max(total)) > best:
                 best = value
                 left, top = int(left) - margin[0], int(top) - margin[1]
-                found = Edges(left / small, top / small, (left + size[0]) / small,
+                best_crop = Edges(left / small, top / small, (left + size[0]) / small,
                              (top + size[1]) / small)  # fmt: skip
-    return found
+    return best_crop
 
 
 class _Couple(NamedTuple):
@@ -161,7 +161,7 @@ def _matched(pair: Pair, crops: Sequence[Edges]) -> _Couple:
     high = round(height * wide / width)
     trues = [_resized(_gray(frame), high, wide) for frame in true]
     scale = (wide / width, high / height)
-    best, found = -1.0, None
+    best, best_couple = -1.0, None
     for frame in video:
         gray = _gray(frame)
         for crop in crops:
@@ -170,10 +170,10 @@ def _matched(pair: Pair, crops: Sequence[Edges]) -> _Couple:
             for other in trues:
                 couple = _Couple(image, other, scale)
                 if (value := _correlation(crop, couple)) > best:
-                    best, found = value, couple
-    if found is None:
+                    best, best_couple = value, couple
+    if best_couple is None:
         return _Couple(_resized(_gray(video[0]), high, wide), trues[0], scale)
-    return found
+    return best_couple
 
 
 def _evidence(crop: Edges, couples: Sequence[_Couple]) -> Float[np.ndarray, " n"]:
@@ -228,8 +228,8 @@ def _refine(start: Edges, couples: Sequence[_Couple]) -> Edges:
     simplex = np.vstack([np.zeros(4), np.eye(4)])
     for _ in range(2):  # restarted once, since a simplex may collapse
         options = {"initial_simplex": simplex, "xatol": 2e-3, "fatol": 1e-5, "maxfev": 400}
-        found = minimize(cost, simplex[0], method="Nelder-Mead", options=options).x
-        simplex = np.vstack([found, found + 0.3 * np.eye(4)])
+        minimum = minimize(cost, simplex[0], method="Nelder-Mead", options=options).x
+        simplex = np.vstack([minimum, minimum + 0.3 * np.eye(4)])
     return Edges(*(origin + simplex[0] * steps).tolist())
 
 

@@ -71,8 +71,8 @@ class Evaluation:
     @classmethod
     def of(cls, scoring: Scoring, rows: Sequence[Row], **options: Any) -> Evaluation:
         """Return the result of a scoring."""
-        columns = {**KNOWN, **columns_of(scoring.measures)}
-        definitions = {k: v for measure in scoring.measures for k, v in measure.definitions.items()}
+        measured = columns_of(scoring.measures)
+        definitions = {key: column.definition for key, column in measured.items()}
         options.setdefault("shown", SHOWN)
         present = {row.method for row in rows}
         titles = {row_of(method): method.title for method in scoring.methods}
@@ -80,7 +80,7 @@ class Evaluation:
         return cls(
             rows=rows,
             titles={name: title for name, title in titles.items() if name in present},
-            columns=columns,
+            columns={**KNOWN, **measured},
             definitions=definitions,
             protocol=scoring.protocol,
             skipped=scoring.skipped,
@@ -116,7 +116,7 @@ class Evaluation:
 
     def differences(self) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
         """Return the paired differences of each method from the first method, by group."""
-        found: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
+        by_group: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
         reference, *others = self.titles
         for group, by_method in self._grouped().items():
             start = {row.window: row.scores for row in by_method.get(reference, ())}
@@ -126,14 +126,14 @@ class Evaluation:
                 pairs = [(row.scores, start.get(row.window)) for row in by_method.get(method, ())]
                 shared = [(scores, at) for scores, at in pairs if at is not None]
                 if len(shared) > 1:
-                    found.setdefault(group, {})[method] = {
+                    by_group.setdefault(group, {})[method] = {
                         key: paired_difference(
                             [scores[key] for scores, _ in shared], [at[key] for _, at in shared]
                         )
                         for key in shared[0][0]
                         if not is_feature(key)
                     }
-        return found
+        return by_group
 
     def by_index(self) -> dict[str, list[dict[str, Any]]]:
         """Return the summaries of each method over the first, second, ... windows of all clips.
@@ -145,7 +145,7 @@ class Evaluation:
             starts.setdefault(row.window.files.video_id, set()).add(row.window.start)
         if max(map(len, starts.values())) == 1:
             return {}
-        places = {name: sorted(found) for name, found in starts.items()}
+        places = {name: sorted(of_clip) for name, of_clip in starts.items()}
         scores: dict[str, dict[int, list[Scores]]] = {}
         for row in self.rows:
             if row.own:
@@ -153,8 +153,8 @@ class Evaluation:
             place = places[row.window.files.video_id].index(row.window.start)
             scores.setdefault(row.method, {}).setdefault(place, []).append(row.scores)
         return {
-            method: [self._summary(found[place]) for place in sorted(found)]
-            for method, found in scores.items()
+            method: [self._summary(by_place[place]) for place in sorted(by_place)]
+            for method, by_place in scores.items()
         }
 
     def _grouped(self) -> dict[str, dict[str, list[Row]]]:
@@ -256,7 +256,7 @@ class Evaluation:
             "baselines (prior, first frame repeated) does no better than copying",
         ]
         fewest = min(
-            rows["clips"] for found in self.summaries().values() for rows in found.values()
+            rows["clips"] for methods in self.summaries().values() for rows in methods.values()
         )
         if self.differences() and fewest < FEW_CLIPS:
             lines.append(

@@ -121,20 +121,20 @@ class Scoring:
         windows = self._windows(clips)
         lengths = {folder.name: self._lengths(folder, windows) for folder in self.folders}
         for folder in self.folders:
-            found = find_crops(
+            crops = find_crops(
                 folder,
                 lengths[folder.name],
                 cache=self.cache,
                 every=self.protocol.registered == "all",
             )
-            self.crops.extend(found)
+            self.crops.extend(crops)
         rows: list[Row] = []
         for window in track(windows, "comparing", total=len(windows)):
-            known = {name: of[window] for name, of in lengths.items() if window in of}
-            if not known:
+            infos = {name: of[window] for name, of in lengths.items() if window in of}
+            if not infos:
                 continue
             try:
-                rows += self._compare(window, known)
+                rows += self._compare(window, infos)
             except InputError as error:
                 self.skipped.append(f"{window.output_id}: {error}")
         for line in self.skipped:
@@ -161,8 +161,8 @@ class Scoring:
                     )
                 done = {"start": 0, "status": "done"}
                 results = {name: {"source_id": name, **done} for name in rows}
-            known = {line["source_id"] for line in results.values()}
-            if absent := [name for name in rows if name not in known]:
+            generated = {line["source_id"] for line in results.values()}
+            if absent := [name for name in rows if name not in generated]:
                 count = f"{len(absent)} of {counted(len(rows), 'clip')}"
                 self.absent.append(
                     f"{count} of the metadata not in {folder.path}: {listing(absent)}"
@@ -203,13 +203,13 @@ class Scoring:
         )
         return {window: shape for window, shape in lengths.items() if shape.frames == usual}
 
-    def _compare(self, window: Window, known: Mapping[str, VideoInfo]) -> list[Row]:
+    def _compare(self, window: Window, infos: Mapping[str, VideoInfo]) -> list[Row]:
         """Return the scores of every method on one window."""
         path = window.files.target
         if path is None:
             raise InputError(f"{window.files.row} has no ground truth. (column video)")
         truth = probe_video(path)
-        count = min(shape.frames for shape in known.values())
+        count = min(shape.frames for shape in infos.values())
         if self.protocol.lengths == "common":
             count = min(count, truth.frames - window.start)
         if count <= self.protocol.first:
@@ -217,17 +217,17 @@ class Scoring:
         methods = []
         for method in self.methods:
             absent = isinstance(method, Folder) and not method.file(window).exists()
-            if absent or (method in self.folders and method.name not in known):
+            if absent or (method in self.folders and method.name not in infos):
                 continue
             for source in method.sources(window):
                 _check_rate(method.name, source, probe_video(source), path, truth)
             methods.append(method)
         crops = {m.name: m.crops.get(window.output_id, WHOLE) for m in self.folders}
         common = WHOLE
-        for name in known:
+        for name in infos:
             common = common.common(crops[name])
-        like = truth if self.protocol.size == "target" else next(iter(known.values()))
-        shown = WHOLE if self.protocol.size == "target" else crops[next(iter(known))]
+        like = truth if self.protocol.size == "target" else next(iter(infos.values()))
+        shown = WHOLE if self.protocol.size == "target" else crops[next(iter(infos))]
         all_rows = [(self._shape(count, common, like, shown, truth), methods, False)]
         if self.protocol.registered == "all":
             for method in methods:
@@ -239,7 +239,7 @@ class Scoring:
         for shape, scored, own in all_rows:
             compared = _Truth(path, window, shape, self.protocol.first)
             for method in scored:
-                video = known.get(method.name)
+                video = infos.get(method.name)
                 rows.append(
                     Row(
                         window=window,
@@ -288,14 +288,14 @@ class Scoring:
         video: np.ndarray | None = None
         scores: dict[str, float] = {}
         for measure in self.measures:
-            key = fingerprint([content, type(measure).__name__, measure.settings(truth.window)])
-            found = self.cache.get(key)
-            if found is None:
+            key = fingerprint([content, measure.name, measure.settings(truth.window)])
+            values = self.cache.get(key)
+            if values is None:
                 if video is None:
                     video = method.video(truth.window, truth.shape, truth.known.frames)
-                found = truth.scorer(measure)(video)
-                self.cache.put(key, found)
-            scores |= found
+                values = truth.scorer(measure)(video)
+                self.cache.put(key, values)
+            scores |= values
         return scores
 
 
@@ -326,12 +326,12 @@ def row_of(method: Method) -> str:
     return method.row if isinstance(method, Folder) else method.name
 
 
-def _check_rate(name: str, path: Path, own: VideoInfo, target: Path, truth: VideoInfo) -> None:
+def _check_rate(name: str, path: Path, video: VideoInfo, target: Path, truth: VideoInfo) -> None:
     """Raise `InputError` if two videos differ in their frame rate."""
-    if abs(own.fps / truth.fps - 1) > MAX_RATE_ERROR:
-        slower, rate = (target, own.fps) if own.fps < truth.fps else (path, truth.fps)
+    if abs(video.fps / truth.fps - 1) > MAX_RATE_ERROR:
+        slower, rate = (target, video.fps) if video.fps < truth.fps else (path, truth.fps)
         raise InputError(
-            f"{name} has {float(own.fps):g} frames a second, the ground truth "
+            f"{name} has {float(video.fps):g} frames a second, the ground truth "
             f"{float(truth.fps):g}: frames are compared one by one, so both need one rate. Convert "
             f"the faster one with `ffmpeg -i {slower.name} -vf fps={rate} -crf 0 slower.mp4`. "
             "(--generated, column video)"

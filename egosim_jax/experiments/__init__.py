@@ -5,6 +5,7 @@ Metrics and reports of any generated clips belong to `evaluation`.
 
     config         settings of all experiments, which are also the command-line options
     scenes         held-out clips of the tabletop world and their scores
-    training       make clips, train a denoiser, cache videos
-    dwm_variants   models of the experiment dwm; dwm_training trains them
+    training       make clips, train a denoiser
+    report         scores by method, report, tables, plots, cached values
+    dwm_training   models of the experiment dwm and their trainings
 """

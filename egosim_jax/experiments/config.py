@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -13,21 +13,39 @@ if TYPE_CHECKING:
 
 Ids = Literal["given", "none"]
 """Object ids of a state: given, or none, so that perception must find what a hand moves."""
+Count = int
+"""Number from 1."""
+Seed = int
+"""Number from 0."""
+
+
+class Checked:
+    """Settings whose numbers are checked by their types, `Count` and `Seed`."""
+
+    def check(self) -> None:
+        """Raise `InputError` for the first number out of range."""
+        for field in fields(self):  # pyright: ignore[reportArgumentType]
+            option, value = f"--{field.name.replace('_', '-')}", getattr(self, field.name)
+            if "Count" in str(field.type):
+                for number in value if isinstance(value, tuple) else (value,):
+                    check_counts({option: number})
+            elif field.type == "Seed":
+                check_seed(value, name=option)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ModelExperiment:
+class ModelExperiment(Checked):
     """Settings of every experiment that uses a trained model."""
 
     out: Path
     """Folder of the report and images."""
-    first_scene: int
+    first_scene: Seed
     """Seed of the first scene."""
     config: str = "tabletop"
     """Name of the model."""
     weights: Path | None = None
     """Folder of weights; by default the shipped ones."""
-    steps: int | None = None
+    steps: Count | None = None
     """Denoising steps, instead of the model's."""
 
     def open(self) -> Generator:
@@ -37,8 +55,7 @@ class ModelExperiment:
         from egosim_jax.io.run import open_folder
         from egosim_jax.io.weights import hashes
 
-        check_counts({"--steps": self.steps})
-        check_seed(self.first_scene, name="--first-scene")
+        self.check()
         config = configs.get(self.config)
         config = replace(config, steps=self.steps or config.steps)
         weights = configs.weights_of(self.config, self.weights)
@@ -57,18 +74,16 @@ class Tabletop(ModelExperiment):
     contact sheets.
     """
 
-    scenes: int = 24
+    scenes: Count = 24
     """Number of scenes with human hands, and with the robot."""
-    first_scene: int = 100
+    first_scene: Seed = 100
     """Seed of the first scene; the shipped model was trained on seeds from 1000 on."""
-    seeds: int = 2
+    seeds: Count = 2
     """Number of repetitions of each clip with different noise."""
-    batch_size: int = 8
+    batch_size: Count = 8
     """Number of clips generated together."""
     black_cloths: int = 0
     """Maximum number of black cloths on a table, which look like holes in the prior."""
-    worst: int | None = None
-    """Number of worst scenes to draw, with the goals that they miss; None: no such sheet."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,11 +95,11 @@ class Continuous(ModelExperiment):
     interrupted experiment.
     """
 
-    sequences: int = 12
+    sequences: Count = 12
     """Number of sequences; their seeds are consecutive."""
-    clips: int = 10
+    clips: Count = 10
     """Number of clips per sequence."""
-    first_scene: int = 600
+    first_scene: Seed = 600
     """Seed of the first sequence; the shipped model was trained on seeds from 1000 on."""
     ids: Ids = "given"
     """Object ids in the first state of classical perception."""
@@ -105,23 +120,23 @@ class Students(ModelExperiment):
     """Name of the student."""
     teacher: str = "tabletop"
     """Name of the teacher, whose weights are in the student's folder."""
-    teacher_steps: tuple[int, ...] = (2, 4, 10)
+    teacher_steps: tuple[Count, ...] = (2, 4, 10)
     """Denoising steps of the teacher, a row for each."""
-    student_steps: tuple[int, ...] = (1,)
+    student_steps: tuple[Count, ...] = (1,)
     """Other denoising steps of the student, a row for each."""
     stages: tuple[str, ...] = ()
     """Stages of the student's training, each as NAME=FILE; the file is a run's lora.safetensors."""
-    scenes: int = 24
+    scenes: Count = 24
     """Number of scenes."""
-    first_scene: int = 100
+    first_scene: Seed = 100
     """Seed of the first scene; the shipped model was trained on seeds from 1000 on."""
-    batch_size: int = 8
+    batch_size: Count = 8
     """Number of clips generated together."""
     sequences: int = 12
     """Number of sequences in the loop; 0: no loop."""
-    first_sequence: int = 600
+    first_sequence: Seed = 600
     """Seed of the first sequence."""
-    clips: int = 10
+    clips: Count = 10
     """Number of clips per sequence."""
 
 
@@ -129,16 +144,18 @@ class Students(ModelExperiment):
 class Update(ModelExperiment):
     """Carry an object in held-out scenes, update the state, and compare it with the ground truth.
 
-    The rows: the oracle at 832 x 480 and at the model's size, and classical perception of
-    ground-truth, generated and gray frames. Prints a table and writes report.json.
+    The rows: the oracle at 832 x 480 and at the model's size, and perception of ground-truth,
+    generated and gray frames. Prints a table and writes report.json.
     """
 
-    scenes: int = 24
+    scenes: Count = 24
     """Number of scenes in which an object is carried."""
-    first_scene: int = 600
+    first_scene: Seed = 600
     """Seed of the first scene; the shipped model was trained on seeds from 1000 on."""
+    perception: str = "classical"
+    """Perception pipeline with its options: a name, or MODULE:NAME of your own."""
     ids: Ids = "given"
-    """Object ids in the state of classical perception."""
+    """Object ids in the state of this perception."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,9 +167,9 @@ class LookAway(ModelExperiment):
     report.json and contact_sheet.png. The same command resumes an interrupted experiment.
     """
 
-    scenes: int = 12
+    scenes: Count = 12
     """Number of scenes in which an object is carried."""
-    first_scene: int = 300
+    first_scene: Seed = 300
     """Seed of the first scene; the shipped model was trained on seeds from 1000 on."""
 
 
@@ -165,13 +182,13 @@ class Policies(ModelExperiment):
     The same command resumes an interrupted experiment.
     """
 
-    scenes: int = 24
+    scenes: Count = 24
     """Number of scenes in which an object is carried."""
-    first_scene: int = 400
+    first_scene: Seed = 400
     """Seed of the first scene; the shipped model was trained on seeds from 1000 on."""
     perception: str = "classical"
     """Perception pipeline that measures success in generated clips, with its options."""
-    batch_size: int = 5
+    batch_size: Count = 5
     """Number of clips generated together."""
 
 
@@ -194,7 +211,7 @@ class Hyperparameters:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Embodiment:
+class Embodiment(Checked):
     """Train on human hands, then on a few robot clips: all weights, or a LoRA.
 
     Another model is trained only on the robot clips. With --robot, one more is trained on as many
@@ -209,13 +226,13 @@ class Embodiment:
     """Name of the model."""
     weights: Path | None = None
     """Folder of weights with the autoencoder; by default the shipped ones."""
-    human_scenes: int = 400
+    human_scenes: Count = 400
     """Number of scenes with human hands to train on, one clip each."""
-    robot_scenes: int = 24
+    robot_scenes: Count = 24
     """Number of robot scenes to train on, one clip each."""
-    held_out: int = 24
+    held_out: Count = 24
     """Number of robot scenes to validate on and to generate, one clip each."""
-    first_scene: int = 5000
+    first_scene: Seed = 5000
     """Seed of the first scene; the shipped autoencoder was trained on seeds 1000 to 1999."""
     human: Hyperparameters = Hyperparameters(steps=1200, learning_rate=2e-3, warmup=50)
     """Training on human clips, from random weights."""
@@ -231,13 +248,13 @@ class Embodiment:
     """Robot of the converted clips, a name in `egosim robot list`; None: no converted clips."""
     converted: Hyperparameters = Hyperparameters(steps=200, learning_rate=5e-4, warmup=10)
     """Training of all weights on converted clips, from the human model."""
-    rank: int = 16
+    rank: Count = 16
     """Rank of the LoRA."""
     dropout: float = 0.15
     """Dropout probability of each condition in training."""
-    steps: int = 10
+    steps: Count = 10
     """Denoising steps of the generated clips."""
-    batch_size: int = 8
+    batch_size: Count = 8
     """Number of clips encoded, and generated, together."""
 
 
@@ -250,18 +267,18 @@ class Rank(ModelExperiment):
     videos. The ground truth through the autoencoder is another row. Writes report.json.
     """
 
-    goals: int = 24
+    goals: Count = 24
     """Number of goals, each in a different scene."""
     candidates: int = 4
     """Number of actions per goal."""
-    first_scene: int = 400
+    first_scene: Seed = 400
     """Seed of the first scene."""
-    seeds: int = 2
+    seeds: Count = 2
     """Number of repetitions of each clip with different noise."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class DWM:
+class DWM(Checked):
     """Train DWM and its ablations in miniature on static versions of tabletop clips, and compare.
 
     Trains an autoencoder, an inpainting base, an image-to-video base, and from the bases DWM, a
@@ -276,13 +293,13 @@ class DWM:
     """Name of the model."""
     only: tuple[str, ...] = ()
     """Models to train and compare, besides DWM; by default all."""
-    moving_scenes: int = 240
+    moving_scenes: Count = 240
     """Number of scenes with a moving camera to train on, one clip each."""
-    fixed_scenes: int = 96
+    fixed_scenes: Count = 96
     """Number of scenes with a fixed camera to train on, one clip each."""
-    held_out: int = 24
+    held_out: Count = 24
     """Number of held-out scenes with a moving camera, and with a fixed one."""
-    first_scene: int = 20000
+    first_scene: Seed = 20000
     """Seed of the first scene."""
     autoencoder: Hyperparameters = Hyperparameters(
         steps=1500, learning_rate=1e-3, warmup=200, batch_size=2
@@ -296,19 +313,19 @@ class DWM:
         steps=700, learning_rate=2e-3, warmup=50, batch_size=4
     )
     """Training of each model from its base."""
-    rank: int | None = 48
+    rank: Count | None = 48
     """Rank of the LoRA that adapts a base; None: all weights are trained."""
     products: Literal["bfloat16"] | None = "bfloat16"
     """Dtype of the factors of matrix products in the denoisers; None: the model's."""
     text_dropout: float = 0.1
     """Dropout probability of the prompt in training."""
-    seeds: int = 2
+    seeds: Count = 2
     """Number of repetitions of each clip with different noise."""
-    steps: int = 4
+    steps: Count = 4
     """Denoising steps of the generated clips."""
     strength: float = 0.75
     """Strength of SDEdit: fraction of the steps, from the noised static video."""
-    batch_size: int = 8
+    batch_size: Count = 8
     """Number of clips encoded, and generated, together."""
 
 

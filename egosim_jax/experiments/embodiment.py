@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import matplotlib
 import numpy as np
-from matplotlib.figure import Figure
 
 from egosim_jax import configs, rendering
 from egosim_jax.conditioning.condition import ConditionDropout
@@ -16,31 +14,31 @@ from egosim_jax.configs.model import ModelConfig
 from egosim_jax.data.manifest import MANIFEST
 from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.shards import ShardReader, ShardWriter
-from egosim_jax.data.sheet import draw_sheet
-from egosim_jax.evaluation.metrics.report import Summary, paired_differences, print_table, summarize
+from egosim_jax.evaluation.metrics.report import summarize
 from egosim_jax.experiments.config import Embodiment, Hyperparameters
+from egosim_jax.experiments.report import (
+    Table,
+    cached_videos,
+    differences_of,
+    plot,
+    show,
+    write_report,
+)
 from egosim_jax.experiments.scenes import (
     DEFINITIONS,
     MEASURES,
-    SHEET_MOMENTS,
-    SHEET_SCENES,
     HeldOutClip,
     baselines,
-    conditions_of,
+    draw_scenes,
     evaluate,
     generate,
+    make_scenes,
     reconstruct,
 )
-from egosim_jax.experiments.training import (
-    cached_videos,
-    make_frames,
-    train_config,
-    train_denoiser,
-)
+from egosim_jax.experiments.training import make_frames, train_config, train_denoiser
 from egosim_jax.generation.generator import Generator
-from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.bounded import read_lines
-from egosim_jax.io.run import open_folder, write_json
+from egosim_jax.io.run import open_folder
 from egosim_jax.io.weights import hashes
 from egosim_jax.robots.arms import arm_of
 from egosim_jax.robots.conversion import convert, triplets_of
@@ -49,14 +47,12 @@ from egosim_jax.robots.sources import of_episode
 from egosim_jax.runtime.progress import track
 from egosim_jax.train.encode import encode_shards
 from egosim_jax.train.tasks.denoising import Denoising
-from egosim_jax.types import InputError, Kind, check_counts, check_seed
+from egosim_jax.types import InputError, Kind
 from egosim_jax.worlds.tabletop import make_sequence, to_episode
-from egosim_jax.worlds.tabletop.dataset import DatasetConfig
+from egosim_jax.worlds.tabletop.dataset import DatasetConfig, conditions_of
 
 Videos = Mapping[str, Sequence[np.ndarray]]
 """Videos of all scenes by method."""
-Validation = Mapping[int, float]
-"""Validation loss by step."""
 CONVERTED = "converted"
 METHODS = {
     "human": "human alone",
@@ -80,18 +76,8 @@ REPORT_DEFINITIONS = {
 
 def run(settings: Embodiment) -> None:
     """Make clips, train, generate, compare and draw."""
-    check_counts(
-        {
-            "--human-scenes": settings.human_scenes,
-            "--robot-scenes": settings.robot_scenes,
-            "--held-out": settings.held_out,
-            "--rank": settings.rank,
-            "--batch-size": settings.batch_size,
-            "--steps": settings.steps,
-        }
-    )
-    check_seed(settings.first_scene, name="--first-scene")
-    stages = (settings.human, settings.full, settings.lora, settings.scratch, settings.converted)
+    settings.check()
+    out, stages = settings.out, [getattr(settings, name) for name in METHODS]
     for stage in stages:
         train_config(stage)  # raises for invalid values before any work
     experiment = _Experiment(settings)
@@ -101,36 +87,45 @@ def run(settings: Embodiment) -> None:
             "model conditioned on keypoints. (--config)"
         )
     record = {"experiment": settings, "weights": hashes(experiment.origin)}
-    open_folder(settings.out, record, mutable=["experiment.out", "experiment.weights"])
+    open_folder(out, record, mutable=["experiment.out", "experiment.weights"])
     trained = experiment.train_all()
-    scenes = [
-        HeldOutClip.make(seed, experiment.model.video, "robot", point_px=experiment.model.point_px)
-        for seed in track(experiment.unseen, "making held-out scenes", total=settings.held_out)
-    ]
-    videos = experiment.generate_all(trained, scenes)
-    validations = {name: _validation(settings.out / name) for name in trained}
-    scores = _scores(scenes, videos)
-    table = _summaries(scores, validations)
-    report = {"definitions": REPORT_DEFINITIONS, "table": table, "validation": validations}
-    if CONVERTED in trained:
-        report["differences"] = {
-            name: paired_differences(scores[CONVERTED], scores[name], MEASURES)
-            for name in ("full", "human")
-        }
-    write_json(settings.out / "report.json", report)
-    print_table(
-        "",
-        {METHODS.get(name, name): row for name, row in table.items()},
-        {**LOSSES, **MEASURES},
-        title="robot, held out: mean ± spread over scenes",
+    scenes = make_scenes(
+        experiment.unseen,
+        experiment.model,
+        "robot",
+        title="held-out scenes",
+        conditions=("state", "skeleton"),
     )
+    videos = experiment.generate_all(trained, scenes)
+    losses = {name: _validation(out / name) for name in trained}
+    named = track(videos.items(), "comparing", total=len(videos))
+    scores = {name: evaluate(scenes, of) for name, of in named}
+    table: Table = {}
+    for name, of in scores.items():
+        table[name] = summarize(of, MEASURES)
+        if name in losses:
+            first, *_, last = losses[name].values()
+            table[name] = {"before": {"mean": first}, "after": {"mean": last}, **table[name]}
+    report = {"definitions": REPORT_DEFINITIONS, "table": table, "validation": losses}
+    compared = {name: scores[name] for name in (CONVERTED, "full", "human") if name in scores}
+    differences = {}
     if CONVERTED in trained:
-        differences = {METHODS[name]: row for name, row in report["differences"].items()}
+        differences = differences_of(CONVERTED, compared, MEASURES)
+    write_report(out, **report, **({"differences": differences} if differences else {}))
+    rows = {METHODS.get(name, name): row for name, row in table.items()}
+    show("robot, held out: mean ± spread over scenes", rows, {**LOSSES, **MEASURES})
+    if differences:
         title = "with converted clips, less: mean difference and its 95 % interval"
-        print_table("", differences, MEASURES, title=title)
+        show(title, {METHODS[name]: row for name, row in differences.items()}, MEASURES)
     for name in trained.keys() - {"human", "scratch"}:
-        print(_verdict(METHODS[name], validations[name]))
-    _draw(settings.out, scenes, videos, validations)
+        first, *_, last = losses[name].values()
+        verb = "lowers" if last < first else "does not lower"
+        change = f"from {first:.3f} to {last:.3f}"
+        print(f"{METHODS[name]}: training on the robot {verb} the validation loss, {change}")
+    sheet, curves = out / "contact_sheet.png", out / "curves.png"
+    draw_scenes(sheet, scenes, {name: videos[name] for name in trained})
+    _draw_curves(losses, curves)
+    print(f"{sheet}\n{curves}")
 
 
 class _Experiment:
@@ -168,24 +163,23 @@ class _Experiment:
     def generate_all(self, trained: Mapping[str, Path], scenes: Sequence[HeldOutClip]) -> Videos:
         """Generate the held-out clips by each model; add the baselines."""
         size, folder = self.settings.batch_size, self.out / "generated"
-        videos = {
-            name: cached_videos(
-                folder / f"{name}.npy",
-                lambda name=name: generate(self._generator(trained, name), scenes, batch_size=size),
-                total=len(scenes),
-            )
+
+        def load(name: str) -> Generator:
+            if name == "lora":
+                return Generator.load(self.model, trained["human"], lora=trained[name])
+            return Generator.load(self.model, trained[name])
+
+        makers: dict[str, Callable[[], Iterable[np.ndarray]]] = {
+            name: lambda name=name: generate(load(name), scenes, batch_size=size)
             for name in trained
         }
-        reconstructed = cached_videos(
-            folder / "autoencoder.npy",
-            lambda: reconstruct(self._generator(trained, "human"), scenes, batch_size=size),
-            total=len(scenes),
-        )
-        return {
-            **videos,
-            **baselines(scenes),
-            "ground truth through the autoencoder": reconstructed,
+        makers["autoencoder"] = lambda: reconstruct(load("human"), scenes, batch_size=size)
+        videos = {
+            name: cached_videos(folder / f"{name}.npy", make, total=len(scenes))
+            for name, make in makers.items()
         }
+        coded = videos.pop("autoencoder")
+        return {**videos, **baselines(scenes), "ground truth through the autoencoder": coded}
 
     def _encode(self, split: str, seeds: range, kind: Kind) -> Path:
         """Make the clips of a split and cache their latents."""
@@ -202,9 +196,14 @@ class _Experiment:
         with ShardWriter(frames, kind="frames", spec=spec, grid=self.model.grid) as writer:
             for seed in track(self.robot, f"converting to {name}", total=len(self.robot)):
                 episode = to_episode([next(make_sequence(seed, spec=spec))], fps=spec.fps)
-                found = convert(of_episode(episode), robot)
-                px = self.model.point_px
-                for triplet in triplets_of(found, f"{name}_{seed}", renderer, point_px=px):
+                triplets = triplets_of(
+                    convert(of_episode(episode), robot),
+                    f"{name}_{seed}",
+                    renderer,
+                    point_px=self.model.point_px,
+                    prior=self.model.prior,
+                )
+                for triplet in triplets:
                     record = triplet_record(triplet)
                     writer.add(record.arrays, record.metadata)
         return frames
@@ -245,29 +244,6 @@ class _Experiment:
             others=lambda: self.origin,
         )
 
-    def _generator(self, trained: Mapping[str, Path], name: str) -> Generator:
-        if name == "lora":
-            return Generator.load(self.model, trained["human"], lora=trained[name])
-        return Generator.load(self.model, trained[name])
-
-
-def _draw(
-    out: Path,
-    scenes: Sequence[HeldOutClip],
-    videos: Videos,
-    validations: Mapping[str, Validation],
-) -> None:
-    """Draw the contact sheet and the validation curves."""
-    sheet = out / "contact_sheet.png"
-    clips = [
-        scene.on_sheet({name: videos[name][number] for name in validations})
-        for number, scene in enumerate(scenes[:SHEET_SCENES])
-    ]
-    draw_sheet(clips, sheet, moments=SHEET_MOMENTS)
-    curves = out / "curves.png"
-    draw_curves(validations, curves)
-    print(f"{sheet}\n{curves}")
-
 
 def _validation(folder: Path) -> dict[int, float]:
     """Return the validation losses of a training by step."""
@@ -275,47 +251,16 @@ def _validation(folder: Path) -> dict[int, float]:
     return {x["step"]: x["validation_loss"] for _, x in lines if "validation_loss" in x}
 
 
-def _scores(scenes: Sequence[HeldOutClip], videos: Videos) -> dict[str, list[dict[str, float]]]:
-    """Return the scores of each method on each scene."""
-    names = track(videos, "comparing", total=len(videos))
-    return {name: evaluate(scenes, videos[name]) for name in names}
-
-
-def _summaries(
-    scores: Mapping[str, list[dict[str, float]]], validations: Mapping[str, Validation]
-) -> dict[str, Summary]:
-    """Summarize each method over the scenes; trained models also have losses."""
-    table = {}
-    for name, found in scores.items():
-        losses = {}
-        if name in validations:
-            first, *_, last = validations[name].values()
-            losses = {"before": {"mean": first}, "after": {"mean": last}}
-        table[name] = {**losses, **summarize(found, MEASURES)}
-    return table
-
-
-def _verdict(title: str, validation: Validation) -> str:
-    """Return a sentence on the change of the validation loss in a training."""
-    first, *_, last = validation.values()
-    verb = "lowers" if last < first else "does not lower"
-    change = f"from {first:.3f} to {last:.3f}"
-    return f"{title}: training on the robot {verb} the validation loss, {change}"
-
-
-def draw_curves(validations: Mapping[str, Validation], path: Path) -> None:
+def _draw_curves(losses: Mapping[str, Mapping[int, float]], path: Path) -> None:
     """Plot validation loss over steps: training on human clips (left) and robot clips (right)."""
-    matplotlib.use("agg")
-    figure = Figure(figsize=(11, 4), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True)
-    for name, losses in validations.items():
-        axes = left if name == "human" else right
-        axes.plot(list(losses), list(losses.values()), marker="o", label=METHODS[name])
-    for axes, title in ((left, "on human clips"), (right, "on robot clips")):
-        axes.set_title(f"training {title}")
-        axes.set_xlabel("step")
-        axes.grid(visible=True, alpha=0.3)
-        axes.legend()
-    left.set_ylabel("validation loss, held-out robot clips")
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, dpi=100)
+    with plot(path, 11, 4) as figure:
+        left, right = figure.subplots(1, 2, sharey=True)
+        for name, by_step in losses.items():
+            axes = left if name == "human" else right
+            axes.plot(list(by_step), list(by_step.values()), marker="o", label=METHODS[name])
+        for axes, title in ((left, "on human clips"), (right, "on robot clips")):
+            axes.set_title(f"training {title}")
+            axes.set_xlabel("step")
+            axes.grid(visible=True, alpha=0.3)
+            axes.legend()
+        left.set_ylabel("validation loss, held-out robot clips")

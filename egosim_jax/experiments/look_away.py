@@ -7,9 +7,8 @@ model and perception get no hand that is out of view; only the true world execut
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from itertools import count, islice
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -17,19 +16,19 @@ from jaxtyping import Bool, UInt8
 
 from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.evaluation.metrics import region
-from egosim_jax.evaluation.metrics.report import paired_differences, print_table, summarize
 from egosim_jax.evaluation.metrics.state_update import ON_SURFACE_M, distance_to_mesh
 from egosim_jax.experiments.config import LookAway
-from egosim_jax.experiments.continuous import METHODS, folder_name
+from egosim_jax.experiments.continuous import METHODS, NOT_UPDATED, folder_name
+from egosim_jax.experiments.report import differences_from, show, summaries, write_report
+from egosim_jax.experiments.scenes import carrying
 from egosim_jax.generation.generator import Generator
 from egosim_jax.geometry import invert, transform
-from egosim_jax.io.run import write_json
 from egosim_jax.perception import registry
 from egosim_jax.runtime.progress import track
 from egosim_jax.simulation.rollout import Rollout, load_clip
 from egosim_jax.simulation.simulator import Simulator
 from egosim_jax.state.fuse import fuse
-from egosim_jax.types import Action, Clip, SceneState, VideoSpec, check_counts
+from egosim_jax.types import Action, Clip, SceneState, VideoSpec
 from egosim_jax.worlds.tabletop import (
     Script,
     TabletopClip,
@@ -97,8 +96,8 @@ class Story:
         clip, last = self.clips[-1], slice(-FRAMES_BACK, None)
         number = clip.body_ids[self.target]
         here = clip.ids[last] == number
-        found = region.find(number, frames[last], self.background, clip.paints)
-        errors = region.centroid_errors(found, here)
+        silhouettes = region.find(number, frames[last], self.background, clip.paints)
+        errors = region.centroid_errors(silhouettes, here)
         error = 100 * float(np.median(errors)) / frames.shape[2] if len(errors) else np.nan
         return {
             "kept": 100.0 * (error <= NEAR_PERCENT),
@@ -109,8 +108,8 @@ class Story:
     def score_state(self, state: SceneState) -> dict[str, float]:
         """Return the accuracy of the object in the last state."""
         clip = self.clips[-1]
-        part, number = clip.parts[self.target], clip.body_ids[self.target]
-        surface = transform(clip.world_from_body[self.target][-1], part.vertices_m), part.triangles
+        body, number = clip.parts[self.target], clip.body_ids[self.target]
+        surface = transform(clip.world_from_body[self.target][-1], body.vertices_m), body.triangles
         points = state.points_m[state.object_ids == number]
         near = distance_to_mesh(points, surface) <= ON_SURFACE_M if len(points) else np.zeros(1)
         return {"state_accuracy": 100 * float(near.mean())}
@@ -118,39 +117,40 @@ class Story:
 
 def run(settings: LookAway) -> None:
     """Simulate every story by each method and compare the last frames."""
-    check_counts({"--scenes": settings.scenes})
-    generator = settings.open()
+    generator, out = settings.open(), settings.out
     spec = generator.config.video
-    seeds = list(islice(_seeds(settings, spec), settings.scenes))
+    scripts = carrying(settings.first_scene, spec)
+    outside = (seed for seed, script in scripts if _turn_away(script) is not None)
+    seeds = list(islice(outside, settings.scenes))
     jobs = [(case, seed) for case in CASES for seed in seeds]
     scores: dict[str, list[dict[str, float]]] = {}
     for case, seed in track(jobs, "scenes", total=len(jobs)):
         story = make_story(seed, spec, case)
-        found = {TRUE: story.score(story.clips[-1].frames) | _perceive_true(story, spec)}
+        true = story.score(story.clips[-1].frames) | _perceive_true(story, spec)
+        scores.setdefault(f"{case}: {TRUE}", []).append(true)
         for method in METHODS:
-            folder = settings.out / case / folder_name(method) / str(seed)
-            found[method] = _simulate(story, generator, method, folder)
-        for method, values in found.items():
-            scores.setdefault(f"{case}: {method}", []).append(values)
-    _report(settings.out, seeds, scores)
-    _draw(settings.out, seeds[:SHEET_SCENES], spec)
+            simulated = _simulate(story, generator, method, _folder(out, case, method, seed))
+            scores.setdefault(f"{case}: {method}", []).append(simulated)
+    table, differences = summaries(scores, MEASURES), {}
+    for case in CASES:
+        by_method = {f"{case}: {method}": scores[f"{case}: {method}"] for method in METHODS}
+        differences |= differences_from(f"{case}: {NOT_UPDATED}", by_method, MEASURES)
+    write_report(
+        out,
+        definitions=DEFINITIONS,
+        seeds=seeds,
+        table=table,
+        scores=scores,
+        differences=differences,
+    )
+    show("after looking back: mean ± spread over scenes", table, MEASURES)
+    show("difference from no update, with its 95 % interval", differences, MEASURES)
+    _draw(out, seeds[:SHEET_SCENES], spec)
 
 
-def _report(out: Path, seeds: list[int], scores: Mapping[str, list[dict[str, float]]]) -> None:
-    table = {row: summarize(found, MEASURES) for row, found in scores.items()}
-    differences = {
-        f"{case}: {method}": paired_differences(
-            scores[f"{case}: {method}"], scores[f"{case}: no update"], MEASURES
-        )
-        for case in CASES
-        for method in METHODS
-        if METHODS[method]
-    }
-    report = {"definitions": DEFINITIONS, "seeds": seeds, "table": table, "scores": scores}
-    write_json(out / "report.json", {**report, "differences": differences})
-    print_table("", table, MEASURES, title="after looking back: mean ± spread over scenes")
-    title = "difference from no update, with its 95 % interval"
-    print_table("", differences, MEASURES, title=title)
+def _folder(out: Path, case: str, method: str, seed: int) -> Path:
+    """Return the folder of a simulation."""
+    return out / case / folder_name(method) / str(seed)
 
 
 def _simulate(story: Story, generator: Generator, method: str, folder: Path) -> dict[str, float]:
@@ -177,15 +177,7 @@ def _perceive_true(story: Story, spec: VideoSpec) -> dict[str, float]:
     return story.score_state(state)
 
 
-def _seeds(settings: LookAway, spec: VideoSpec) -> Iterator[int]:
-    """Yield the seeds of scenes with a carried object that can be out of view."""
-    for seed in count(settings.first_scene):
-        script = next(make_scripts(seed, spec=spec))
-        if script.intent.verb == "carry" and _away(script) is not None:
-            yield seed
-
-
-def _away(script: Script) -> float | None:
+def _turn_away(script: Script) -> float | None:
     """Return the turn in radians that takes the object out of view, or None."""
     places = np.stack(
         [moment.scene.body(script.intent.name).world_from_body[:3, 3] for moment in script.moments]
@@ -202,7 +194,7 @@ def _away(script: Script) -> float | None:
 def make_story(seed: int, spec: VideoSpec, case: str) -> Story:
     """Return the clips of a scene, with the object carried in view (`seen`) or out of view."""
     script = next(make_scripts(seed, spec=spec))
-    angle, frames = _away(script), spec.frames
+    angle, frames = _turn_away(script), spec.frames
     if angle is None:
         raise ValueError(f"the object of scene {seed} cannot be out of view")
     joints, prompt = script.action.joints_m[:, :1], script.caption
@@ -251,8 +243,8 @@ def _draw(out: Path, seeds: list[int], spec: VideoSpec) -> None:
             videos = {"ground truth, first clip": story.clips[0].frames}
             videos["ground truth"] = story.clips[-1].frames
             for method in METHODS:
-                folder = out / case / folder_name(method) / str(seed)
-                videos[method] = load_clip(folder / "clip_3" / "frames.npz", spec.fps).frames
+                frames = _folder(out, case, method, seed) / "clip_3" / "frames.npz"
+                videos[method] = load_clip(frames, spec.fps).frames
             title = f"{case}, scene {seed}, last clip: {', '.join(videos)}"
             shown.append(SheetClip(title, list(videos.values())))
     moments = [0, spec.frames // 4, spec.frames // 2, 3 * spec.frames // 4, spec.frames - 1]

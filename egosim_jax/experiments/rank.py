@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from itertools import islice
 
 import numpy as np
@@ -10,14 +11,13 @@ import numpy as np
 from egosim_jax.evaluation.metrics.rank_correlation import spearman
 from egosim_jax.evaluation.metrics.report import paired_difference, print_table
 from egosim_jax.experiments.config import Rank
-from egosim_jax.experiments.scenes import conditions_of
+from egosim_jax.experiments.report import cached, write_report
+from egosim_jax.experiments.scenes import triplet_of
 from egosim_jax.generation.generator import Generator
 from egosim_jax.generation.rank import by_image
-from egosim_jax.io.bounded import read_json
-from egosim_jax.io.run import write_json
 from egosim_jax.runtime.progress import track
-from egosim_jax.types import InputError, Triplet, VideoSpec, check_counts
-from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, to_triplet
+from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.worlds.tabletop import TabletopClip, make_sequence
 
 MEASURES = {"top1": ("top-1 %", "{:.1f}"), "spearman": ("Spearman", "{:.3f}")}
 DEFINITIONS = {
@@ -35,7 +35,7 @@ METHODS = {"generated": "generated videos", "autoencoder": "ground truth through
 
 def run(settings: Rank) -> None:
     """Generate the candidates of every goal, rank them, and compare with the true ranking."""
-    check_counts({"--goals": settings.goals, "--seeds": settings.seeds})
+    settings.check()
     if settings.candidates < 2:
         raise InputError(
             f"A goal with {settings.candidates} candidate cannot be ranked: it needs at least 2. "
@@ -44,35 +44,29 @@ def run(settings: Rank) -> None:
     generator = settings.open()
     seeds = range(settings.first_scene, settings.first_scene + settings.goals)
     goals = [
-        _goal(settings, generator, seed) for seed in track(seeds, "goals", total=settings.goals)
+        cached(settings.out / "goals" / f"{seed}.json", partial(_goal, settings, generator, seed))
+        for seed in track(seeds, "goals", total=settings.goals)
     ]
     table = {name: _summary(goals, name) for name in METHODS}
     chance = 100 / settings.candidates
-    report = {"definitions": DEFINITIONS, "chance": chance, "table": table, "goals": goals}
-    write_json(settings.out / "report.json", report)
+    write_report(settings.out, definitions=DEFINITIONS, chance=chance, table=table, goals=goals)
     rows = {METHODS[name]: row for name, row in table.items()}
-    print_table(
-        "ranking by", rows, MEASURES, title=f"{settings.goals} goals, chance {chance:.0f} %"
-    )
+    title = f"{settings.goals} goals, chance {chance:.0f} %"
+    print_table("ranking by", rows, MEASURES, title=title)
 
 
 def _goal(settings: Rank, generator: Generator, seed: int) -> dict:
-    """Return the scores of a goal's candidates by method, cached in a file."""
-    path = settings.out / "goals" / f"{seed}.json"
-    if path.exists():
-        return read_json(path)
+    """Return the scores of a goal's candidates by method."""
     clips = candidates(seed, generator.config.video, settings.candidates)
     best = seed % len(clips)
-    triplets = [_triplet(clip, generator) for clip in clips]
+    triplets = [triplet_of(clip, generator.config) for clip in clips]
     goal = clips[best].frames[-1]
     score = by_image(goal, goal.shape[:2])
-    generated = [
-        [score(clip.frames) for clip in generator.generate(triplets, [n + repeat for n in noise])]
-        for noise, repeat in (
-            (range(len(clips)), 1000 * seed + 100 * r) for r in range(settings.seeds)
-        )
-    ]
-    found = {
+    generated = []
+    for repeat in range(settings.seeds):
+        noise = [number + 1000 * seed + 100 * repeat for number in range(len(clips))]
+        generated.append([score(clip.frames) for clip in generator.generate(triplets, noise)])
+    return {
         "seed": seed,
         "best": best,
         "captions": [clip.caption for clip in clips],
@@ -80,13 +74,6 @@ def _goal(settings: Rank, generator: Generator, seed: int) -> dict:
         "generated": np.mean(generated, axis=0).tolist(),
         "autoencoder": [score(clip.frames) for clip in generator.reconstruct(triplets)],
     }
-    write_json(path, found)
-    return found
-
-
-def _triplet(clip: TabletopClip, generator: Generator) -> Triplet:
-    prior, hands = conditions_of(generator.config)
-    return to_triplet(clip, prior=prior, hands=hands, point_px=generator.point_px)
 
 
 def candidates(seed: int, spec: VideoSpec, number: int) -> list[TabletopClip]:
@@ -104,13 +91,13 @@ def candidates(seed: int, spec: VideoSpec, number: int) -> list[TabletopClip]:
                 seen.add(caption)
                 yield variant
 
-    found = list(islice(different(), number))
-    if len(found) < number:
+    variants = list(islice(different(), number))
+    if len(variants) < number:
         raise InputError(
-            f"Scene {seed} has {len(found)} different actions, not {number}: ask for fewer. "
+            f"Scene {seed} has {len(variants)} different actions, not {number}: ask for fewer. "
             "(--candidates)"
         )
-    return [next(make_sequence(seed, spec=spec, variant=variant)) for variant in found]
+    return [next(make_sequence(seed, spec=spec, variant=variant)) for variant in variants]
 
 
 def _summary(goals: Sequence[dict], method: str) -> dict[str, dict[str, float]]:

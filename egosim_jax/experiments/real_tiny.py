@@ -1,5 +1,7 @@
 """`egosim experiment real_tiny`: train a small model on recorded clips and compare its clips.
 
+`egosim experiment debug` does the same in a few minutes, with the model `debug` on synthetic clips.
+
 Each clip is also generated with the prior, mask and hands of another clip. The drop of the scores
 measures how much the model uses its conditions.
 """
@@ -18,27 +20,29 @@ from egosim_jax.data.metadata import read_metadata
 from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.data.windows import read_results, windows_of
 from egosim_jax.evaluation.evaluate import evaluate
-from egosim_jax.experiments.config import RealTiny
+from egosim_jax.experiments.config import Debug, RealTiny
 from egosim_jax.generation.batch import BatchJob
 from egosim_jax.io.run import write_json, write_text
 from egosim_jax.io.video import read_video
-from egosim_jax.train.recipes import REAL_TINY
+from egosim_jax.train.from_scratch import SYNTHETIC_CLIPS
+from egosim_jax.train.recipes import DEBUG, REAL_TINY
 
 SHEET_FRAMES = (4, 10, 16)
 """Frames of each clip on the contact sheet."""
 
 
-def run(settings: RealTiny) -> None:
+def run(settings: RealTiny | Debug) -> None:
     """Train, generate, compare and draw."""
-    replace(REAL_TINY, metadata=settings.metadata, out=settings.out).run()
-    compare(
-        "real_tiny",
-        settings.metadata,
-        settings.out,
-        starts=settings.start,
-        seed=settings.seed,
-        batch_size=settings.batch_size,
-    )
+    out, seed = settings.out, settings.seed
+    if isinstance(settings, RealTiny):
+        starts, size = settings.start, settings.batch_size
+        replace(REAL_TINY, metadata=settings.metadata, out=out).run()
+        compare("real_tiny", settings.metadata, out, starts=starts, seed=seed, batch_size=size)
+        return
+    vae = replace(DEBUG.vae, steps=settings.steps)
+    denoiser = replace(DEBUG.denoiser, steps=settings.steps)
+    replace(DEBUG, out=out, vae=vae, denoiser=denoiser).run()
+    compare("debug", out / SYNTHETIC_CLIPS, out, starts=(0,), seed=seed, batch_size=2)
 
 
 def compare(
@@ -72,11 +76,11 @@ def compare(
         "swapped": report_of("swapped", _swap(metadata, out / "swapped.jsonl")),
     }
     for split, methods in reports["generated"]["splits"].items():
-        own, other = (
+        with_own, with_other = (
             rows["generated"]["psnr"]["mean"]
             for rows in (methods, reports["swapped"]["splits"][split])
         )
-        print(f"{split}: another clip's prior and hands cost {own - other:.2f} dB")
+        print(f"{split}: another clip's prior and hands cost {with_own - with_other:.2f} dB")
     write_json(out / "report.json", reports)
     sheet = out / "contact_sheet.png"
     draw_sheet(list(_sheet_clips(out / "generated")), sheet, moments=SHEET_FRAMES)

@@ -4,41 +4,44 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from egosim_jax import configs
 from egosim_jax.configs.model import ModelConfig, Networks
-from egosim_jax.data.sheet import draw_sheet
 from egosim_jax.evaluation.metrics.loop import DEFINITIONS as LOOP_DEFINITIONS
 from egosim_jax.evaluation.metrics.loop import MEASURES as LOOP_MEASURES
-from egosim_jax.evaluation.metrics.report import paired_differences, print_table, summarize
 from egosim_jax.experiments.config import Students
-from egosim_jax.experiments.continuous import draw_curves, simulate
+from egosim_jax.experiments.continuous import by_clip, draw_curves, simulate
+from egosim_jax.experiments.report import (
+    Scores,
+    differences_of,
+    show,
+    show_by_clip,
+    summaries,
+    write_report,
+)
 from egosim_jax.experiments.scenes import (
     DEFINITIONS,
     MEASURES,
-    SHEET_MOMENTS,
-    SHEET_SCENES,
     HeldOutClip,
-    conditions_of,
+    draw_scenes,
     evaluate,
     generate,
+    make_scenes,
 )
 from egosim_jax.generation.causal import chunks_of
 from egosim_jax.generation.generator import Generator
-from egosim_jax.io.run import write_json
 from egosim_jax.io.weights import hashes
 from egosim_jax.models import lora
 from egosim_jax.runtime.progress import track
-from egosim_jax.types import InputError, check_counts
+from egosim_jax.types import InputError
 
 STUDENT = "student"
 UNTRAINED = "teacher's weights, chunk by chunk"
-OWN_MEASURES = {**MEASURES, "color": ("mean color, levels", "{:.2f}")}
-OWN_DEFINITIONS = {
+ROW_MEASURES = {**MEASURES, "color": ("mean color, levels", "{:.2f}")}
+ROW_DEFINITIONS = {
     **DEFINITIONS,
     "color": "distance of the mean color from the ground truth, frames 1 to the last; the largest "
     "of the channels, 255 levels",
@@ -53,11 +56,6 @@ Row = tuple[str, Generator]
 
 def run(settings: Students) -> None:
     """Generate the scenes by each denoiser, simulate the sequences, and compare."""
-    counts = {"--scenes": settings.scenes, "--batch-size": settings.batch_size}
-    check_counts({**counts, "--clips": settings.clips})
-    for option in ("--teacher-steps", "--student-steps"):
-        for steps in getattr(settings, option[2:].replace("-", "_")):
-            check_counts({option: steps})
     stages = [_stage(text) for text in settings.stages]
     student = settings.open()
     chunks_of(student.config)  # raises for a config without chunks
@@ -67,7 +65,7 @@ def run(settings: Students) -> None:
     if settings.sequences:
         whole = Generator(teacher, Networks.load(teacher, folder))
         report |= _compare_loops(settings, {"teacher": whole, STUDENT: student})
-    write_json(settings.out / "report.json", report)
+    write_report(settings.out, **report)
 
 
 def _stage(text: str) -> tuple[str, Path]:
@@ -109,40 +107,26 @@ def _others(
 
 def _compare_clips(settings: Students, student: Generator, others: Iterator[Row]) -> dict:
     """Score each row on the held-out scenes, and draw a sheet of the first ones."""
-    config, seeds = student.config, range(settings.scenes)
-    prior, hands = conditions_of(config)
-    make = partial(HeldOutClip.make, prior=prior, hands=hands, point_px=config.point_px)
-    scenes = [
-        make(settings.first_scene + seed, config.video, "human")
-        for seed in track(seeds, "making scenes", total=settings.scenes)
-    ]
-    scores: dict[str, list[dict[str, float]]] = {}
+    seeds = range(settings.first_scene, settings.first_scene + settings.scenes)
+    scenes = make_scenes(seeds, student.config, title="scenes")
+    scores: dict[str, Scores] = {}
     shown: dict[str, list[np.ndarray]] = {}
     for name, generator in [*others, (STUDENT, student)]:
-        made = generate(generator, scenes, batch_size=settings.batch_size)
-        videos = list(track(made, name, total=len(scenes)))
-        colors = [_color_error(video, scene) for video, scene in zip(videos, scenes, strict=True)]
+        generated = generate(generator, scenes, batch_size=settings.batch_size)
+        videos = list(track(generated, name, total=len(scenes)))
         scores[name] = [
-            {**found, "color": color}
-            for found, color in zip(evaluate(scenes, videos), colors, strict=True)
+            {**values, "color": _color_error(video, scene)}
+            for values, video, scene in zip(evaluate(scenes, videos), videos, scenes, strict=True)
         ]
-        shown[name] = videos[:SHEET_SCENES]
-    table = {name: summarize(found, OWN_MEASURES) for name, found in scores.items()}
-    differences = {
-        name: paired_differences(scores[STUDENT], found, OWN_MEASURES)
-        for name, found in scores.items()
-        if name != STUDENT
-    }
-    first = next(iter(shown))
-    sheet = [
-        scene.on_sheet({first: shown[first][n], STUDENT: shown[STUDENT][n]})
-        for n, scene in enumerate(scenes[:SHEET_SCENES])
-    ]
-    draw_sheet(sheet, settings.out / "contact_sheet.png", moments=SHEET_MOMENTS)
-    print_table("", table, OWN_MEASURES, title="mean ± spread over scenes")
+        if not shown or name == STUDENT:
+            shown[name] = videos
+    table = summaries(scores, ROW_MEASURES)
+    differences = differences_of(STUDENT, scores, ROW_MEASURES)
+    draw_scenes(settings.out / "contact_sheet.png", scenes, shown)
+    show("mean ± spread over scenes", table, ROW_MEASURES)
     title = "the student's differences from each row, with their 95 % interval"
-    print_table("", differences, OWN_MEASURES, title=title)
-    return {"definitions": OWN_DEFINITIONS, "table": table, "differences": differences}
+    show(title, differences, ROW_MEASURES)
+    return {"definitions": ROW_DEFINITIONS, "table": table, "differences": differences}
 
 
 def _color_error(video: np.ndarray, scene: HeldOutClip) -> float:
@@ -153,32 +137,19 @@ def _color_error(video: np.ndarray, scene: HeldOutClip) -> float:
 
 def _compare_loops(settings: Students, generators: Mapping[str, Generator]) -> dict:
     """Score the sequences, clip by clip, of teacher and student."""
-    first = settings.first_sequence
-    jobs = [
-        (name, seed) for seed in range(first, first + settings.sequences) for name in generators
-    ]
-    runs: dict[str, list] = {name: [] for name in generators}
+    seeds = range(settings.first_sequence, settings.first_sequence + settings.sequences)
+    jobs = [(name, seed) for seed in seeds for name in generators]
+    runs: dict[str, list[Scores]] = {name: [] for name in generators}
     for name, seed in track(jobs, "sequences", total=len(jobs)):
-        folder = settings.out / "loop" / name / str(seed)
-        found = simulate(
-            generators[name], folder, seed=seed, clips=settings.clips, perception="classical"
+        folder, clips = settings.out / "loop" / name / str(seed), settings.clips
+        runs[name].append(
+            simulate(generators[name], folder, seed=seed, clips=clips, perception="classical")
         )
-        runs[name].append(found)
-    by_clip = {name: list(zip(*found, strict=True)) for name, found in runs.items()}
-    tables = {
-        name: [summarize(clips, LOOP_MEASURES) for clips in found]
-        for name, found in by_clip.items()
-    }
-    differences = [
-        paired_differences(*clips, LOOP_MEASURES)
-        for clips in zip(by_clip[STUDENT], by_clip["teacher"], strict=True)
-    ]
-    for title, rows in (
-        *((f"{name} in the loop: mean ± spread", table) for name, table in tables.items()),
-        ("student in the loop: difference from the teacher, with its 95 % interval", differences),
-    ):
-        numbered = {str(number): row for number, row in enumerate(rows, start=1)}
-        print_table("clip", numbered, LOOP_MEASURES, title=title)
+    tables, differences = by_clip(runs, "teacher")
+    for name, rows in tables.items():
+        show_by_clip(f"{name} in the loop: mean ± spread", rows, LOOP_MEASURES)
+    title = "student in the loop: difference from the teacher, with its 95 % interval"
+    show_by_clip(title, differences[STUDENT], LOOP_MEASURES)
     draw_curves(tables, settings.out / "curves.png")
-    loop = {"definitions": LOOP_DEFINITIONS, "tables": tables, "differences": differences}
+    loop = {"definitions": LOOP_DEFINITIONS, "tables": tables, "differences": differences[STUDENT]}
     return {"loop": loop}

@@ -1,4 +1,4 @@
-"""Steps that the experiments with trainings share: make clips, train a denoiser, cache videos.
+"""Steps that the experiments with trainings share: make clips, train a denoiser.
 
 Each step loads its result if it exists: an interrupted experiment resumes.
 """
@@ -6,13 +6,10 @@ Each step loads its result if it exists: an interrupted experiment resumes.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-
 from egosim_jax.experiments.config import Hyperparameters
-from egosim_jax.io.atomic import atomic_write
 from egosim_jax.runtime.progress import track
 from egosim_jax.train import loop
 from egosim_jax.train.config import OptimizerConfig, TrainConfig
@@ -74,14 +71,3 @@ def train_denoiser(
         task, train_config(stage), data=data, validation=validation, out=out, weights=start
     )
     return write_trained(trained, out, model=task.model, start=start or others(), rank=task.rank)
-
-
-def cached_videos(
-    path: Path, make: Callable[[], Iterable[np.ndarray]], *, total: int
-) -> list[np.ndarray]:
-    """Load the videos of a method from an .npy file, or make and save them."""
-    if not path.exists():
-        videos = list(track(make(), f"generating {path.stem}", total=total))
-        with atomic_write(path) as temporary:
-            np.save(temporary, np.stack(videos))
-    return list(np.load(path))

@@ -8,23 +8,23 @@ from itertools import count, islice
 
 import numpy as np
 
-from egosim_jax.evaluation.metrics.report import print_table, summarize
+from egosim_jax.evaluation.metrics.report import print_table
 from egosim_jax.evaluation.metrics.state_update import (
     ON_SURFACE_M,
     object_accuracy,
     symmetric_distance,
 )
 from egosim_jax.experiments.config import Ids, Update
+from egosim_jax.experiments.report import summaries, write_report
 from egosim_jax.generation.generator import Generator
 from egosim_jax.geometry import invert, pixel_rays, pixels_of, transform
-from egosim_jax.io.run import write_json
 from egosim_jax.perception import registry
 from egosim_jax.rendering.reference import render
 from egosim_jax.runtime.progress import track
 from egosim_jax.state.fuse import fuse
 from egosim_jax.state.new_objects import is_among, without_ids
-from egosim_jax.types import Clip, SceneState, VideoSpec, check_counts
-from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, to_action, to_ground_truth
+from egosim_jax.types import Clip, SceneState, VideoSpec
+from egosim_jax.worlds.tabletop import TabletopClip, make_sequence, observation_of, to_action
 
 LARGE = VideoSpec(frames=17, height=480, width=832, fps=8)
 """Clips at EgoSim's size."""
@@ -51,15 +51,14 @@ DEFINITIONS = {
 
 def run(settings: Update) -> None:
     """Carry an object in every scene, update the state and compare it with the true scene."""
-    check_counts({"--scenes": settings.scenes})
+    registry.parse(settings.perception)  # raises for an unknown one before any work
     generator = settings.open()
-    spec = generator.config.video
     table: dict[str, list[dict[str, float]]] = {}
-    for seed in track(_seeds(settings, spec), "scenes", total=settings.scenes):
-        for row, scores in _rows(seed, spec, generator, settings.ids):
+    for seed in track(_seeds(settings, generator.config.video), "scenes", total=settings.scenes):
+        for row, scores in _rows(seed, generator, settings.perception, settings.ids):
             table.setdefault(row, []).append(scores)
-    summary = {row: summarize(scores, MEASURES) for row, scores in table.items()}
-    write_json(settings.out / "report.json", {"definitions": DEFINITIONS, "table": summary})
+    summary = summaries(table, MEASURES)
+    write_report(settings.out, definitions=DEFINITIONS, table=summary)
     print_table("state after", summary, MEASURES)
 
 
@@ -71,51 +70,54 @@ def _seeds(settings: Update, spec: VideoSpec) -> Iterator[int]:
 
 
 def _rows(
-    seed: int, spec: VideoSpec, generator: Generator, ids: Ids
+    seed: int, generator: Generator, perception: str, ids: Ids
 ) -> Iterator[tuple[str, dict[str, float]]]:
     """Yield the name and the scores of each table row for one scene."""
-    large = next(make_sequence(seed, spec=LARGE))
+    large, spec = next(make_sequence(seed, spec=LARGE)), generator.config.video
     yield f"oracle, {LARGE.width} x {LARGE.height}", evaluate(large, large.frames, "oracle")
     clip = next(make_sequence(seed, spec=spec))
     view = render(clip.state, clip.cameras, point_px=generator.point_px)
     generated = generator(view, to_action(clip), clip.first.colors, seed)
     yield f"oracle, {spec.width} x {spec.height}", evaluate(clip, clip.frames, "oracle")
-    yield "classical, ground-truth frames", evaluate(clip, clip.frames, "classical", ids)
-    yield "classical, generated frames", evaluate(clip, generated, "classical", ids)
-    gray = np.full_like(clip.frames, 127)
-    yield "classical, gray frames", evaluate(clip, gray, "classical", ids)
+    frames = {
+        "ground-truth": clip.frames,
+        "generated": generated,
+        "gray": np.full_like(clip.frames, 127),
+    }
+    for kind, video in frames.items():
+        yield f"{perception}, {kind} frames", evaluate(clip, video, perception, ids)
 
 
 def evaluate(
     clip: TabletopClip, frames: np.ndarray, perception: str, ids: Ids = "given"
 ) -> dict[str, float]:
     """Return the scores of the state after perceiving and fusing the frames of a clip."""
-    perceive = registry.parse(perception).build({clip.number: to_ground_truth(clip)})
+    perceive = registry.parse(perception).build({clip.number: observation_of(clip)})
     before = clip.state
     given = before if ids == "given" else without_ids(before)
     perceived = perceive(Clip(frames=frames, fps=LARGE.fps), to_action(clip), given)
     after = fuse(given, perceived)
     number, path = clip.body_ids[clip.target], clip.world_from_body[clip.target]
-    part = clip.parts[clip.target]
-    own = before.points_m[before.object_ids == number]
+    body = clip.parts[clip.target]
+    points_m = before.points_m[before.object_ids == number]
     numbers = [number]
     if ids == "none":
         new = perceived.new_objects
-        numbers = [n for n, points in new.items() if is_among(points, own).any()]
-    still = (after.object_ids == 0) & is_among(after.points_m, own)
+        numbers = [n for n, points in new.items() if is_among(points, points_m).any()]
+    still = (after.object_ids == 0) & is_among(after.points_m, points_m)
     carried = object_accuracy(
-        own,
+        points_m,
         after.points_m[still | np.isin(after.object_ids, numbers)],
-        surface=(transform(path[-1], part.vertices_m), part.triangles),
+        surface=(transform(path[-1], body.vertices_m), body.triangles),
         seen_m=_visible_surface(clip, number, path),
     )
-    known = before.points_m[before.object_ids == 0]
-    background = _background_seen_before(clip, after)
+    background = before.points_m[before.object_ids == 0]
     return {
         "accuracy": carried.accurate,
         "completeness": carried.complete,
         "ghost": carried.ghost,
-        "background_mm": 1000 * symmetric_distance(known, background),
+        "background_mm": 1000
+        * symmetric_distance(background, _background_seen_before(clip, after)),
     }
 
 

@@ -26,6 +26,7 @@ from jax.sharding import Mesh
 from egosim_jax.conditioning.condition import Name as ConditionName
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.convert.lora import check_base
+from egosim_jax.data.clip_files import prior_problem
 from egosim_jax.data.clips import Policy, check_clip, load_triplet
 from egosim_jax.data.metadata import check_presence
 from egosim_jax.data.sheet import SheetClip, draw_sheet
@@ -38,8 +39,9 @@ from egosim_jax.io.bounded import listing, quote
 from egosim_jax.io.decoding import Decoding
 from egosim_jax.io.digest import sha256_within
 from egosim_jax.io.run import open_folder
-from egosim_jax.io.video import read_video, write_video
+from egosim_jax.io.video import read_video
 from egosim_jax.io.weights import hashes
+from egosim_jax.io.writing import write_video
 from egosim_jax.rendering.mesh import hand_mask
 from egosim_jax.runtime.phases import phase
 from egosim_jax.runtime.terminal import printable
@@ -209,14 +211,14 @@ class BatchJob:
                 files.append(self._reconstruction(window))
             if line.get("status") != "done" or not all(path.exists() for path in files):
                 continue
-            own = {"source_id": window.files.video_id, "start": window.start,
+            expected = {"source_id": window.files.video_id, "start": window.start,
                    "prompt": window.files.prompt,
                    "conditions_sha256": conditions_sha256(window.files)}  # fmt: skip
-            if differing := [name for name in own if line.get(name) != own[name]]:
+            if differing := [name for name in expected if line.get(name) != expected[name]]:
                 raise InputError(
                     f"{self._video(window)} exists and cannot be skipped, because it has another "
                     f"{differing[0]}: {quote(line.get(differing[0]))}, not "
-                    f"{quote(own[differing[0]])}. Choose another folder, or remove the clip. "
+                    f"{quote(expected[differing[0]])}. Choose another folder, or remove the clip. "
                     "(--out)"
                 )
             finished.add(window.output_id)
@@ -235,6 +237,8 @@ class BatchJob:
                 policy=self.policy,
                 grid=self.model.grid,
             )
+            if problem := prior_problem(window.files.extra, self.model.prior):
+                problems.append(f"{window.files.row} ({window.files.video_id}): {problem}")
             target = window.files.target
             if self.reconstruct and (target is None or not target.exists()):
                 problems.append(NO_TRUTH)
@@ -376,7 +380,7 @@ class BatchJob:
         if status == "failed":
             problem = f"failed: {window.output_id}: {values['error']}"
             print(printable(problem), file=sys.stderr)
-        own = {
+        record = {
             "video_id": window.output_id,
             "source_id": window.files.video_id,
             "start": window.start,
@@ -386,9 +390,9 @@ class BatchJob:
             "prompt": window.files.prompt,
         }
         # A column of the metadata must not replace a field of the result.
-        reserved = {*own, "seed", "seconds", "conditions_sha256", "error"}
+        reserved = {*record, "seed", "seconds", "conditions_sha256", "error"}
         extra = window.files.extra.items()
-        line = own | {f"metadata_{k}" if k in reserved else k: text for k, text in extra}
+        line = record | {f"metadata_{k}" if k in reserved else k: text for k, text in extra}
         append_line(self.out / RESULTS, line)
 
     def _video(self, window: Window) -> Path:

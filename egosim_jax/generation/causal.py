@@ -67,14 +67,14 @@ def denoise_chunk(
     """
     chunks = chunks_of(config)
     context = dit.prepare_chunk(channels, shared, chunks.bounds[number])
-    own = None if keys is None else jax.vmap(jax.random.fold_in, (0, None))(keys, number)
+    step_keys = None if keys is None else jax.vmap(jax.random.fold_in, (0, None))(keys, number)
     latents, kept = integrate_keeping(
         lambda x, t: dit.denoise_chunk(x, t, context, cache),
         noise,
         process=config.process,
         solver=config.solver,
         steps=steps_of(config, number),
-        keys=own,
+        keys=step_keys,
     )
     if number == len(chunks.sizes) - 1:  # no later chunk sees the last one
         return latents, cache
@@ -93,12 +93,12 @@ def denoise_chunks(
     """Return the latents of clips, whose chunks are made one after the other in one program."""
     channels = config.layout.condition_channels(condition, noise)
     shared = dit.share(jnp.asarray(condition.text), condition.image)
-    cache, found = dit.empty_cache(len(noise), config.latent_shape), []
+    cache, chunks = dit.empty_cache(len(noise), config.latent_shape), []
     for number, (start, end) in enumerate(pairwise(chunks_of(config).bounds)):
         given = channels[:, start:end], noise[:, start:end], shared, cache
         latents, cache = denoise_chunk(dit, *given, config, number, keys)
-        found.append(latents)
-    return jnp.concatenate(found, axis=1)
+        chunks.append(latents)
+    return jnp.concatenate(chunks, axis=1)
 
 
 class ChunkDenoiser:
@@ -151,11 +151,11 @@ class ChunkDenoiser:
         for number, (program, size) in enumerate(
             zip(self._denoise, self.chunks.sizes, strict=True)
         ):
-            part = (
+            of_chunk = (
                 jax.ShapeDtypeStruct((x.shape[0], size, *x.shape[2:]), x.dtype)
                 for x in (channels, noise)
             )
-            given = (*part, shared, cache, *seeds)
+            given = (*of_chunk, shared, cache, *seeds)
             yield f"chunk {number + 1}", program, given
             _, cache = program.shapes(*given)
 
@@ -178,13 +178,13 @@ class ChunkDenoiser:
         for conditions of another number or length.
         """
         shared, cache = self._share(text, image)
-        own = (seeds,) if self.config.solver.stochastic else ()
+        step_seeds = (seeds,) if self.config.solver.stochastic else ()
         number = 0
         for number, channels in enumerate(conditions, start=1):
             self._check(number, channels.shape[1])
             start, end = self.chunks.bounds[number - 1 : number + 1]
             program = self._denoise[number - 1]
-            latents, cache = program(channels, noise[:, start:end], shared, cache, *own)
+            latents, cache = program(channels, noise[:, start:end], shared, cache, *step_seeds)
             yield latents
         if number != len(self.chunks.sizes):
             self._check(number, 0)

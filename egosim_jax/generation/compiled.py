@@ -90,10 +90,12 @@ class CompiledFn:
             check_batch(jax.tree.leaves(args)[0].shape[0], self._mesh)
         return tuple(
             jax.tree.map(
-                lambda leaf, own=own: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=own),
+                lambda leaf, sharding=sharding: jax.ShapeDtypeStruct(
+                    leaf.shape, leaf.dtype, sharding=sharding
+                ),
                 arg,
             )
-            for arg, own in zip(args, shardings, strict=True)
+            for arg, sharding in zip(args, shardings, strict=True)
         )
 
     def _shardings(self, args: tuple) -> tuple[NamedSharding | None, ...]:
@@ -101,7 +103,7 @@ class CompiledFn:
         if self._mesh is None:
             return (None,) * len(args)
         axes = self._in_axes or (BATCH,) * len(args)
-        return tuple(NamedSharding(self._mesh, spec(*own)) for own in axes)
+        return tuple(NamedSharding(self._mesh, spec(*dims)) for dims in axes)
 
     def __call__(self, *args: Any) -> Any:
         """Run the function; compile it first if necessary."""

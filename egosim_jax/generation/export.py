@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
+from egosim_jax.data.clip_files import prior_column
 from egosim_jax.data.clips import write_clips
-from egosim_jax.rendering import POINT_PX, Renderer, jitted
+from egosim_jax.dynamics import predict
+from egosim_jax.rendering import POINT_PX, PriorKind, Renderer, jitted
 from egosim_jax.rendering.hand_mesh import pose_hands
 from egosim_jax.rendering.mesh import MovingMesh
 from egosim_jax.rendering.mesh_reference import draw_scene
@@ -28,15 +30,17 @@ def write_conditions(
     first_frame: UInt8[np.ndarray, "h w 3"] | None = None,
     renderer: Renderer = jitted,
     point_px: int = POINT_PX,
+    prior: PriorKind = "static",
 ) -> Path:
     """Write prior, mask and hand videos of an action in EgoSim's layout; return its metadata.csv.
 
     Rows of other clips in the folder stay; a clip of the same `video_id` is replaced.
-    `point_px` is the side of a point, which must be the model's. The first frame defaults to the
-    view's. Raises `InputError` if the first camera sees none
-    of the state, and for a `video_id` that is not a valid file name.
+    `point_px` is the side of a point, and `prior` says where objects are drawn; both must be the
+    model's. The first frame defaults to the view's. Raises `InputError` if the first camera sees
+    none of the state, and for a `video_id` that is not a valid file name.
     """
-    view = renderer.render(state, action.cameras, point_px=point_px)
+    motion = predict(state, action, fps=fps) if prior == "predicted" else None
+    view = renderer.render(state, action.cameras, point_px=point_px, motion=motion)
     triplet = Triplet(
         video_id=video_id,
         prompt=action.prompt,
@@ -44,6 +48,7 @@ def write_conditions(
         mask=view.mask,
         hands=renderer.draw_hands(action.joints_m, action.cameras, kind=action.kind)[0],
         first_frame=view.frames[0] if first_frame is None else first_frame,
+        extra=prior_column(prior),
     )
     return write_clips(Path(folder), [triplet], fps=fps, append=True)
 

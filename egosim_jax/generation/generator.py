@@ -59,7 +59,7 @@ from egosim_jax.generation.stream import (
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.run import plain
 from egosim_jax.models import CausalDenoiser, Denoiser
-from egosim_jax.rendering import Renderer, jitted
+from egosim_jax.rendering import PriorKind, Renderer, jitted
 from egosim_jax.runtime.phases import phase
 from egosim_jax.sharding import fetch, shard_params
 from egosim_jax.types import (
@@ -111,6 +111,7 @@ def denoise(
         solver=config.solver,
         steps=config.visited,
         keys=keys,
+        cache=config.cache,
     )
 
 
@@ -180,6 +181,11 @@ class Generator:
         """Side of the points of a prior in pixels."""
         return self.config.point_px
 
+    @property
+    def prior(self) -> PriorKind:
+        """Objects in a prior: at rest, or on their predicted paths."""
+        return self.config.prior
+
     @classmethod
     def load(
         cls,
@@ -187,7 +193,7 @@ class Generator:
         weights: Path | str | None = None,
         *,
         mesh: Mesh | None = None,
-        lora: Path | None = None,
+        lora: Path | str | None = None,
         lora_scale: float = 1.0,
         renderer: Renderer = jitted,
     ) -> Generator:
@@ -209,8 +215,8 @@ class Generator:
             from egosim_jax.io.weights import hashes
             from egosim_jax.models.lora import apply
 
-            check_base(lora, [hashes(folder, only=["dit"])["dit"]])
-            apply(networks.dit, read_lora(lora, config.dit), scale=lora_scale)
+            check_base(Path(lora), [hashes(folder, only=["dit"])["dit"]])
+            apply(networks.dit, read_lora(Path(lora), config.dit), scale=lora_scale)
         return cls(config.at(folder), networks, mesh, renderer=renderer)
 
     @property
@@ -223,7 +229,7 @@ class Generator:
     ) -> Iterator[tuple[str, CompiledFn, tuple]]:
         """Yield name, function and input shapes of each function that `generate` calls.
 
-        `streamed` yields the functions of `groups`; a causal student always streams.
+        `streamed` yields the functions of `groups`.
         """
         config, codec = self.config, self.codec
         whole = self.denoiser is None
@@ -234,12 +240,12 @@ class Generator:
         seeds = jax.ShapeDtypeStruct((batch,), np.uint32)
         yield "noise", self._noise, (seeds,)
         noise = self._noise.shapes(seeds)
-        condition, own = self.encode.shapes(arrays), self._step_seeds(seeds)
+        condition, step_seeds = self.encode.shapes(arrays), self._step_seeds(seeds)
         if self.denoiser is None:
-            yield "denoise", self._denoise, (condition, noise, *own)
+            yield "denoise", self._denoise, (condition, noise, *step_seeds)
         else:
-            yield from self.denoiser.programs(condition.text, condition.image, noise, *own)
-        if codec is not None and (streamed or not whole):
+            yield from self.denoiser.programs(condition.text, condition.image, noise, *step_seeds)
+        if codec is not None and streamed:
             yield from codec.decode_programs(batch)
         else:
             yield "decode", self.decode, (noise,)
@@ -264,9 +270,10 @@ class Generator:
         """Return the number of `programs`, without tracing any."""
         codec, whole = self.codec, self.denoiser is None
         count = 3 if self.denoiser is None else 2 + self.denoiser.count_programs()
-        if codec is None or (whole and not streamed):
+        if codec is None:
             return count + 1
-        return count + (0 if whole else len(codec.encoded_chunks(1))) + codec.count_decoders()
+        decoders = codec.count_decoders() if streamed else 1
+        return count + (0 if whole else len(codec.encoded_chunks(1))) + decoders
 
     def generate(
         self,
@@ -281,10 +288,7 @@ class Generator:
         `InputError` if a mesh does not divide the batch, and `NonFiniteError` naming the clips
         whose latents are not finite.
         """
-        if self.denoiser is None:
-            return self._clips(fetch(self.decode(self.latents(triplets, seeds, without=without))))
-        groups = list(self.groups(triplets, seeds, without=without))
-        return self._clips(np.concatenate(groups, axis=1))
+        return self._clips(fetch(self.decode(self.latents(triplets, seeds, without=without))))
 
     def latents(
         self,
@@ -302,8 +306,10 @@ class Generator:
             latents = self._denoise(condition, self.noise(seeds), *step_seeds)
         else:
             clips = ClipStream(self, seeds, without)
-            found = [clips.denoise(part) for part in self._split(triplets)]
-            latents = jnp.concatenate(found, axis=1)
+            chunks = [
+                clips.denoise(triplets_of_chunk) for triplets_of_chunk in self._split(triplets)
+            ]
+            latents = jnp.concatenate(chunks, axis=1)
         bad = [n for n, latent in enumerate(fetch(latents)) if not np.isfinite(latent).all()]
         if bad:
             raise NonFiniteError([triplet.video_id for triplet in triplets], bad)
@@ -322,29 +328,21 @@ class Generator:
         Raises the errors of `generate`.
         """
         clips = ClipStream(self, seeds, without)
-        for number, part in enumerate(self._split(triplets)):
-            clips.put(part)  # before the frames of the chunk before are fetched
+        for number, triplets_of_chunk in enumerate(self._split(triplets)):
+            clips.put(triplets_of_chunk)  # before the frames of the chunk before are fetched
             if number:
                 yield from clips.take()
         yield from clips.take()
 
     def begin(self, first_frame: UInt8[np.ndarray, "h w 3"], seed: int) -> ViewStream:
-        """Begin a clip of a simulation (`simulator.ChunkedGenerator`)."""
+        """Begin a clip of a simulation (`streams.ChunkedGenerator`)."""
         check_seed(seed, name="seed")
         return ViewStream(self, first_frame, seed)
-
-    def stream(
-        self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
-    ) -> Iterator[UInt8[np.ndarray, "g h w 3"]]:
-        """Yield the frames of one clip of a simulation in groups, as they are decoded."""
-        check_seed(seed, name="seed")
-        for frames in self.groups([self.condition(view, action, first_frame)], [seed]):
-            yield frames[0]
 
     def __call__(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
     ) -> UInt8[np.ndarray, "f h w 3"]:
-        """Generate one clip of a simulation (`simulator.VideoGenerator`).
+        """Generate one clip of a simulation (`streams.VideoGenerator`).
 
         Raises the errors of `condition` and `generate`.
         """

@@ -116,14 +116,14 @@ def rank(jobs: Sequence[BatchJob], windows: Sequence[Window], score: Score) -> l
     for job in jobs:
         job.open()
         job.generate(windows, load=load)
-        for name, found in scores.items():
+        for name, of_candidate in scores.items():
             path = job.out / f"{name}.mp4"
             if not path.exists():
                 raise InputError(
                     f"The candidate {name} has no clip in {job.out}; its results.jsonl says why. "
                     "All candidates must be generated to be ranked. (--actions)"
                 )
-            found.append(score(read_video(path).frames))
+            of_candidate.append(score(read_video(path).frames))
     return order(scores)
 
 

@@ -99,14 +99,14 @@ class CodecPrograms:
 
     def encoded_chunks(self, batch: int) -> dict[int, dict[str, Any]]:
         """Return the shapes of the videos of each chunk that needs its own program of `encode`."""
-        found, known = {}, set()
+        shapes, kinds = {}, set()
         for number, frames in enumerate(self.config.chunk_frames):
             videos = video_shapes(batch, self.config, number)
             videos.pop("mask", None)
-            if videos and (kind := (frames, number > 0)) not in known:
-                known.add(kind)
-                found[number] = videos
-        return found
+            if videos and (kind := (frames, number > 0)) not in kinds:
+                kinds.add(kind)
+                shapes[number] = videos
+        return shapes
 
     def count_decoders(self) -> int:
         """Return the number of `decode_programs`, without tracing any."""
@@ -263,7 +263,7 @@ class ClipStream:
 
 
 class ViewStream:
-    """One clip of a simulation, chunk by chunk (`simulator.ClipStream`).
+    """One clip of a simulation, chunk by chunk (`streams.ClipStream`).
 
     On a mesh whose devices share a batch, all of them make the same clip.
     """
@@ -301,10 +301,10 @@ def split_triplet(triplet: Triplet, lengths: Sequence[int]) -> list[Triplet]:
 def _encode_next(codec: CausalCodec, videos: dict[str, Any], caches: Any) -> tuple[Any, Any]:
     """Return the latents of the next frames of several videos, and the new caches."""
     before = caches or dict.fromkeys(videos)
-    found = {
+    split = {
         name: codec.encode_next(to_model(video), before[name]) for name, video in videos.items()
     }
-    latents, after = ({name: pair[n] for name, pair in found.items()} for n in range(2))
+    latents, after = ({name: pair[n] for name, pair in split.items()} for n in range(2))
     return latents, after
 
 

@@ -7,8 +7,9 @@ Readers of a dataset's layout belong to `data`, and conversion of other projects
 - untrusted: readers of HDF5, Parquet, COLMAP, npz, pickles and `.pth`; they run no code in a file
 - atomic: atomic_write, atomic_folder, append_line, lock_folder
 - digest: sha256 of files and folders, fingerprint of values
-- images, colors: read_image, decode_image, decode_labels, read_depth_image; colors as sRGB
-- video, segments, decoding, boxes: read, probe and write videos
+- images: read_image, decode_image, decode_labels, read_depth_image; colors as sRGB
+- video, decoding, containers, timing: probe and read videos, at a constant rate
+- writing: write videos
 - weights, mapped: save and load networks; memory-mapped safetensors
 - checkpoint, run, journal, differences: training checkpoints, run folders, resumable phases;
   the differences of a refused run

@@ -28,8 +28,8 @@ TEMPORARY = ".tmp"
 """Middle part of every temporary name."""
 LOCK = ".lock"
 """Name of the file that a process locks while it writes to a folder."""
-PART, LOG = ".part", ".part.log"
-"""Suffixes of a large file written in pieces, and of the log of its pieces."""
+PART = ".part"
+"""Suffix of an incomplete large file that is written in pieces."""
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 _NEW = os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC
 

@@ -8,6 +8,8 @@ because Orbax does not notice a changed byte.
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 import sys
 from collections.abc import Awaitable, Iterator, Sequence
@@ -31,6 +33,11 @@ POSITION = "position.json"
 """File in the folder of the data with the position of its iterator."""
 HASHES = "sha256.json"
 """File in a checkpoint's folder with the hashes of all its other files."""
+
+
+def has_checkpoint(run: Path) -> bool:
+    """Return whether a run folder has a checkpoint."""
+    return any(path.name.isdigit() for path in (run / "checkpoints").glob("*"))
 
 
 class Checkpoints:
@@ -115,11 +122,12 @@ class Checkpoints:
 
     @contextmanager
     def _explained(self, step: int) -> Iterator[None]:
-        """Raise `InputError` for a full disk, naming the step and the newest checkpoint."""
+        """Raise `InputError` for a full disk or quota, with the step and the newest checkpoint."""
         try:
             yield
         except Exception as error:
-            if not any("No space left" in str(cause) for cause in _causes(error)):
+            full = [os.strerror(code) for code in (errno.ENOSPC, errno.EDQUOT)]
+            if not any(reason in str(cause) for cause in _causes(error) for reason in full):
                 raise
             kept = max((kept for kept in self.steps if kept < step), default=None)
             newest = "there is no other" if kept is None else f"the newest is of step {kept}"

@@ -1,4 +1,4 @@
-"""Decode untrusted videos, packet by packet and frame by frame.
+"""Open untrusted videos, and decode their frames as they are shown.
 
 Everything that opens a video opens it here, so that each file has one track, geometry and color:
 
@@ -15,24 +15,21 @@ Everything that opens a video opens it here, so that each file has one track, ge
 
 Only the contents of regular files are opened, never names or addresses inside a file. The header is
 checked against limits before anything is decoded. Detectable damage is refused: the decoder must
-report no error, mark no frame as corrupt and return a frame for each packet that the container
-lists. H.264 has no checksum, so a changed bit that leaves a valid stream passes. Frames outside the
-edit list are omitted, as in every player. FFV1 has checksums, which are checked here.
+report no error and mark no frame as corrupt. H.264 has no checksum, so a changed bit that leaves a
+valid stream passes. Frames outside the edit list are omitted, as in every player.
 """
 
 from __future__ import annotations
 
 import io
-import os
+import re
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from fractions import Fraction
-from pathlib import Path
-from typing import Literal, cast
+from typing import Literal, TypeVar, cast
 
 import av
 import numpy as np
-from av import error as ffmpeg_errors
 from av.container import InputContainer
 from av.packet import Packet
 from av.stream import Disposition
@@ -40,19 +37,18 @@ from av.video.frame import VideoFrame
 from av.video.reformatter import ColorPrimaries, Interpolation, VideoReformatter
 from av.video.stream import VideoStream
 
-from egosim_jax.io.bounded import open_regular, quote_path, quote_text
-from egosim_jax.io.boxes import check_boxes
-from egosim_jax.io.ffv1 import is_intact
+from egosim_jax.io.bounded import quote_text
+from egosim_jax.io.containers import MAX_SAMPLES, check_boxes, is_intact
 from egosim_jax.io.images import MAX_IMAGE_PIXELS
 from egosim_jax.types import InputError
 
 MAX_FRAMES = 10_000
-"""Default maximum length of a video in frames."""
+"""Maximum number of frames of one call, with those decoded before them."""
 MAX_PIXELS = 2**31
-"""Maximum number of pixels to decode from one video, frames x height x width: about 10 s."""
-MAX_KEPT = 3 * 2**28
-"""Maximum size of the frames that one call returns, in bytes."""
-
+"""Maximum number of pixels that one call decodes, frames x height x width: about 10 s."""
+MAX_MISSING_S = 0.25
+"""Maximum time between the end of the frames and the end that the header states, in seconds."""
+P = TypeVar("P", Packet, Packet | None)
 File = io.BufferedReader | io.BytesIO
 Decoding = Literal["accurate", "official"]
 """Conversion of YUV to RGB: accurate, or bit-exact with EgoSim's loader (imageio's FFmpeg)."""
@@ -92,14 +88,6 @@ _ONE_VIEW, _RECTILINEAR = (0, 8), 4
 """FFmpeg's types of stereo with one view in a frame, and its projection of a pinhole."""
 _FORMATS = "MP4, MOV, Matroska, WebM, AVI or MPEG-TS"
 _CONVERT = "onvert it, for instance with `ffmpeg -i IN -pix_fmt yuv444p OUT.mp4`."
-_REASONS = {
-    ffmpeg_errors.ArgumentError: "it is of another format",
-    ffmpeg_errors.DecoderNotFoundError: "its codec is not known",
-    ffmpeg_errors.EOFError: "it ends too early",
-    ffmpeg_errors.InvalidDataError: "its data are not valid",
-    ffmpeg_errors.PatchWelcomeError: "it uses a part of its format that is not known",
-}
-"""FFmpeg's errors in plain words; others have its own words."""
 _OPTIONS = {
     "format_whitelist": "mov,mp4,m4a,matroska,webm,avi,mpegts",
     "protocol_whitelist": "none",
@@ -130,26 +118,18 @@ def _decoding(name: str) -> Iterator[None]:
 
 def _reason(error: Exception) -> str:
     """Return the reason of an exception of FFmpeg, without its number and file."""
-    own = error.strerror if isinstance(error, (av.FFmpegError, OSError)) else str(error)
-    return _REASONS.get(type(error)) or quote_text(own or type(error).__name__)
+    words = error.strerror if isinstance(error, (av.FFmpegError, OSError)) else str(error)
+    return quote_text(words or type(error).__name__)
 
 
 @contextmanager
-def open_file(path: Path) -> Iterator[File]:
-    """Open a file, so that FFmpeg gets bytes and never resolves a name."""
-    with open_regular(path) as file:
-        if not os.fstat(file.fileno()).st_size:
-            raise InputError(f"{quote_path(path)} is empty (0 bytes).")
-        yield file
-
-
-@contextmanager
-def open_video(file: File, name: str, max_frames: int | None) -> Iterator[VideoStream]:
-    """Open the main video stream of a file within the limits; None allows any length.
+def open_video(file: File, name: str) -> Iterator[VideoStream]:
+    """Open the main video stream of a file from its beginning, within the limits.
 
     Raises `InputError` for a file without a video stream, or if its color cannot be read right.
     """
     check_boxes(file, name)
+    file.seek(0)
     try:
         container = av.open(file, mode="r", options=_OPTIONS, metadata_errors="replace")
     except Exception as error:
@@ -176,48 +156,58 @@ def open_video(file: File, name: str, max_frames: int | None) -> Iterator[VideoS
                 f"{name} has frames of {area:,} square pixels, more than {MAX_IMAGE_PIXELS:,}, the "
                 f"maximum (sample aspect ratio {stream.sample_aspect_ratio})."
             )
-        check_size(name, stream.frames if max_frames else 1, area, max_frames or 1)
         yield stream
 
 
-def container_of(stream: VideoStream) -> InputContainer:
-    """Return the container that a stream is read from."""
-    return cast(InputContainer, stream.container)
+def read_packets(stream: VideoStream, name: str) -> Iterator[Packet]:
+    """Yield the packets of a stream. Raises `DamagedError`, at the end if the file was cut off.
 
-
-def read_packets(stream: VideoStream, name: str, max_frames: int) -> Iterator[Packet | None]:
-    """Yield packets, then None, which flushes the decoder.
-
-    Raises `DamagedError` at the end if the file was cut off.
+    Raises `InputError` if decoding times go back, because frames would take each other's place.
     """
-    read = 0
-    try:
-        with _decoding(name):
-            for number, packet in enumerate(container_of(stream).demux(stream)):
-                check_size(name, number // 2, 0, max_frames)  # empty packets count, too
-                if packet.is_corrupt:
-                    raise damaged(name, f"it is cut off after {read} frames")
-                if packet.size:
-                    check_packet(stream, packet, name)
-                    read += 1
-                    yield packet
-    except DamagedError:
-        yield None
-        raise
-    yield None
-    listed = len(stream.index_entries)
-    if read < listed:
+    read, end, before, cut, coder = 0, 0, -(1 << 63), False, stream.codec_context
+    with _decoding(name):
+        for number, packet in enumerate(cast(InputContainer, stream.container).demux(stream)):
+            if number > 2 * MAX_SAMPLES:  # empty packets count, too
+                raise InputError(f"{name} has more than {MAX_SAMPLES:,} frames. Split it.")
+            if packet.dts is not None and packet.dts < before:
+                rate = stream.average_rate or stream.guessed_rate or 30
+                raise InputError(
+                    f"{name}: the clock of the file begins again after {read} frames, as where "
+                    "files were joined. Number the frames again, for instance with "
+                    f"`ffmpeg -i IN -vf setpts=N/({rate}*TB) -r {rate} OUT.mp4`."
+                )
+            before = before if packet.dts is None else packet.dts
+            cut |= packet.is_corrupt  # also before a joint of files, which a later packet shows
+            if cut or not packet.size:
+                continue
+            if coder.name == "ffv1" and not is_intact(bytes(packet), coder.extradata):
+                raise damaged(name, "a packet does not have its checksum")
+            if packet.pts is not None:
+                end = max(end, packet.pts + (packet.duration or 0))
+            read += 1
+            yield packet
+    if cut:
+        raise damaged(name, f"it is cut off after {read} frames")
+    if read < (listed := len(stream.index_entries)):
         raise damaged(name, f"it is cut off: it holds {read} of the {listed} frames it lists")
+    end_s = float(end * (stream.time_base or 1))
+    if end_s + MAX_MISSING_S < (declared_s := _declared_s(stream)):
+        raise damaged(name, f"it is cut off at {end_s:.1f} s: its header says {declared_s:.1f} s")
 
 
-def check_packet(stream: VideoStream, packet: Packet, name: str) -> None:
-    """Raise `DamagedError` if a packet does not have the checksum that is in it."""
-    coder = stream.codec_context
-    if coder.name == "ffv1" and not is_intact(bytes(packet), coder.extradata):
-        raise damaged(name, "a packet does not have its checksum")
+def _declared_s(stream: VideoStream) -> float:
+    """Return the length in seconds that Matroska's header states for a track; 0 if none."""
+    container = cast(InputContainer, stream.container)
+    if "matroska" not in container.format.name or not container.duration:
+        return 0.0
+    lengths = [container.duration / av.time_base]
+    if tag := re.fullmatch(r"(\d+):(\d+):(\d+\.\d+)", stream.metadata.get("DURATION", "")):
+        lengths.append(int(tag[1]) * 3600 + int(tag[2]) * 60 + float(tag[3]))
+    # Other tracks may be longer than this one.
+    return min(lengths) if tag or len(container.streams) == 1 else 0.0
 
 
-def skip_leading(packets: Iterable[Packet | None]) -> Iterator[Packet | None]:
+def skip_leading(packets: Iterable[P]) -> Iterator[P]:
     """Omit packets before the first key frame, and frames shown before it.
 
     They refer to frames that are not in the file, as after a cut without encoding (open GOP).
@@ -233,30 +223,44 @@ def skip_leading(packets: Iterable[Packet | None]) -> Iterator[Packet | None]:
         yield packet
 
 
-def decode_packet(stream: VideoStream, packet: Packet | None, name: str) -> list[VideoFrame]:
-    """Decode a packet; None flushes the decoder. Raises `DamagedError`."""
+def decode_frames(
+    stream: VideoStream, name: str, *, key: int | None = None
+) -> Iterator[VideoFrame]:
+    """Yield decoded frames from the beginning, or from the key frame with decoding time `key`.
+
+    Raises `DamagedError` where the video is damaged.
+    """
+    count, size = 0, None
     with _decoding(name):
-        frames = stream.decode(packet)
-    for frame in frames:
-        _check_frame(frame, name)
-    return frames
+        if key is not None:
+            cast(InputContainer, stream.container).seek(key, stream=stream, backward=True)
+        for packet in skip_leading(_whole_packets(stream)):
+            for frame in stream.decode(packet):
+                _check_frame(frame, name)
+                size = size or (frame.width, frame.height)
+                if size != (frame.width, frame.height):
+                    raise InputError(
+                        f"{name} changes its size from {size[0]}x{size[1]} to "
+                        f"{frame.width}x{frame.height} at {frame.time or 0:.2f} s: all frames must "
+                        "have one. Convert it, for instance with "
+                        f"`ffmpeg -i IN -vf scale={size[0]}:{size[1]} OUT.mp4`."
+                    )
+                if frame.is_corrupt:
+                    raise damaged(name, f"its frame at {frame.time} s is corrupt")
+                count += 1
+                check_count(name, count, frame.width * frame.height)
+                yield frame
 
 
-def read_frames(stream: VideoStream, name: str, max_frames: int) -> Iterator[VideoFrame]:
-    """Yield decoded frames. Raises `DamagedError` where the video is damaged."""
-    size = None
-    shown = given = 0
-    for packet in skip_leading(read_packets(stream, name, max_frames)):
-        shown += packet is not None and not packet.is_discard
-        for frame in decode_packet(stream, packet, name):
-            size = size or (frame.height, frame.width)
-            if frame.is_corrupt or size != (frame.height, frame.width):
-                raise damaged(name, f"its frame {given} is corrupt or of another size")
-            given += 1
-            check_size(name, given, size[0] * size[1], max_frames)
-            yield frame
-    if given != shown:
-        raise damaged(name, f"{given} of its {shown} frames can be decoded")
+def _whole_packets(stream: VideoStream) -> Iterator[Packet | None]:
+    """Yield the packets before any damage, then None, which flushes the decoder."""
+    with suppress(av.FFmpegError):
+        for packet in cast(InputContainer, stream.container).demux(stream):
+            if packet.is_corrupt:
+                break
+            if packet.size:
+                yield packet
+    yield None
 
 
 def to_rgb(
@@ -357,39 +361,15 @@ def _display_matrix(frame: VideoFrame) -> tuple[int, int, int, int]:
     return a, b, c, d
 
 
-def check_size(name: str, frames: int, area: int, max_frames: int) -> None:
-    """Raise `InputError` if `frames` frames of `area` pixels exceed the limits."""
-    if frames > max_frames:
-        raise InputError(f"{name} is longer than {max_frames} frames, the maximum.")
+def check_count(name: str, frames: int, area: int) -> None:
+    """Raise `InputError` if `frames` frames of `area` pixels exceed the limits of one call."""
+    if frames > MAX_FRAMES:
+        raise InputError(
+            f"{name}: one call decodes at most {MAX_FRAMES:,} frames. Cut the video, for instance "
+            "with `ffmpeg -i IN -f segment -segment_time 60 OUT%03d.mp4`."
+        )
     if frames * area > MAX_PIXELS:
         raise InputError(
-            f"{name} has more than {MAX_PIXELS:,} pixels ({area:,} per frame), the maximum."
+            f"{name}: one call decodes at most {MAX_PIXELS:,} pixels, and each frame has {area:,}. "
+            "Cut the video, or make it smaller."
         )
-
-
-class FrameBuffer:
-    """Frames of one call, collected without copies and bounded by `MAX_KEPT`."""
-
-    def __init__(self, name: str):
-        self._name, self._kept, self._count = name, np.empty((0,), np.uint8), 0
-
-    def __len__(self) -> int:
-        return self._count
-
-    def append(self, frame: np.ndarray) -> None:
-        """Append a frame of the first frame's shape. Raises `InputError` above the limit."""
-        if self._count == len(self._kept):
-            room = min(max(16, 2 * self._count), MAX_KEPT // frame.nbytes)
-            if room <= self._count:
-                raise InputError(
-                    f"{self._name} has more than {MAX_KEPT:,} bytes of frames ({frame.nbytes:,} "
-                    "each), the maximum of one call."
-                )
-            self._kept.resize((room, *frame.shape), refcheck=False)
-        self._kept[self._count] = frame
-        self._count += 1
-
-    def frames(self) -> np.ndarray:
-        """Return the frames; nothing can be added afterwards."""
-        self._kept.resize((self._count, *self._kept.shape[1:]), refcheck=False)
-        return self._kept

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from egosim_jax.io.atomic import LOG, PART, lock_folder
+from egosim_jax.io.atomic import PART, lock_folder
 from egosim_jax.io.bounded import listing, quote, quote_text, read_json
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.private import cache_folder
@@ -135,28 +135,32 @@ def download(release: Release, folder: Path) -> Release:
     return fetched
 
 
+def read_range(release: Release, path: str, start: int, count: int) -> bytes:
+    """Return a part of a file of a release from `list_files`, without a download of the rest."""
+    from huggingface_hub import hf_hub_url
+    from huggingface_hub.utils import build_hf_headers, hf_raise_for_status, http_stream_backoff
+
+    url = hf_hub_url(release.repository, path, revision=release.revision)
+    headers = build_hf_headers() | {"Range": f"bytes={start}-{start + count - 1}"}
+    with _asking(release), http_stream_backoff("GET", url, headers=headers) as response:
+        hf_raise_for_status(response)
+        if response.status_code != 206:
+            raise ValueError("its server does not send parts of files")
+        return response.read()
+
+
 def bytes_needed(size: int, folder: Path) -> int:
     """Return the free bytes that the rest of a download and its conversion need."""
     files = [*(folder / DOWNLOADS).rglob("*")]
-    for log in folder.glob(f"*{LOG}"):
-        target = log.with_name(log.name.removesuffix(LOG))
-        part = target.with_name(target.name + PART)
-        files.append(part if part.is_file() else target)
-    found = [file.stat() for file in files if file.is_file()]
-    # An unfinished network is a sparse file of its full size: count allocated blocks (512 bytes).
-    written = sum(min(stat.st_size, 512 * stat.st_blocks) for stat in found)
-    return max(2 * size - written, 0)
+    if files:  # a fetch was interrupted: the networks in the folder are of it
+        files += [*folder.glob("*.safetensors"), *folder.glob(f"*{PART}")]
+    return max(2 * size - sum(file.stat().st_size for file in files if file.is_file()), 0)
 
 
-def remove_leftovers(folder: Path, *, keep_download: bool) -> None:
-    """Remove conversion logs and, unless kept, the download of a complete fetch."""
-    downloads = folder / DOWNLOADS
-    if not any(folder.glob(f"*{LOG}")) and (keep_download or not downloads.exists()):
-        return
-    with lock_folder(folder):
-        for log in folder.glob(f"*{LOG}"):
-            log.unlink()
-        if downloads.exists() and not keep_download:
+def remove_download(folder: Path) -> None:
+    """Remove the downloaded files of a complete fetch."""
+    if (downloads := folder / DOWNLOADS).exists():
+        with lock_folder(folder):
             shutil.rmtree(downloads)
 
 

@@ -1,22 +1,26 @@
 """Read images as uint8 RGB arrays, and depth maps, checked before they are decoded.
 
 Every image of a user is opened here. An image is read as viewers show it: turned as EXIF says, in
-sRGB. Cameras of a reconstruction (COLMAP, nerfstudio) are of the pixels as they are stored; its
-readers ask for `pixels="stored"`.
+sRGB of 8 bits. Cameras of a reconstruction (COLMAP, nerfstudio) are of the pixels as they are
+stored; its readers ask for `pixels="stored"`.
+
+An embedded profile (Display P3 of phones, Adobe RGB) is converted to sRGB. Refused are pixels
+without a color (transparent), CMYK without a profile, and colors that other fields say are not
+sRGB: gamma, primaries or HDR of a PNG, Adobe RGB in EXIF.
 """
 
 from __future__ import annotations
 
 import io
+import struct
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float32, Shaped, UInt8
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
 
 from egosim_jax.io.bounded import quote_path, quote_text, read_bytes, refusing
-from egosim_jax.io.colors import FIX, hdr_of_png, to_srgb
 from egosim_jax.io.untrusted.npz import read_npy
 from egosim_jax.types import InputError
 
@@ -30,6 +34,16 @@ IMAGES = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "PPM")
 """Image formats that can be read."""
 MAX_PIXEL_ASPECT = 0.02
 """Maximum relative difference between width and height of a pixel that counts as square."""
+MAX_PROFILE_BYTES = 1 << 22
+"""Maximum size of a color profile in bytes."""
+SRGB_LEVELS = 3
+"""Maximum change of a color, in levels of 255, by a profile that counts as sRGB."""
+_GAMMA, _PRIMARIES = 0.45455, (0.3127, 0.329, 0.64, 0.33, 0.3, 0.6, 0.15, 0.06)
+_ADOBE_RGB = 2
+_HDR = {16: "PQ", 18: "HLG"}
+_FIX = (
+    "Save it as an 8-bit RGB image in sRGB, for instance by `magick IN -colorspace sRGB OUT.png`."
+)
 _INVERSE = {1: 1, 2: 2, 3: 3, 4: 4, 5: 5, 6: 8, 7: 7, 8: 6}
 """Orientation that undoes each EXIF orientation."""
 
@@ -45,7 +59,7 @@ def decode_image(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Decode the bytes of an image file (`read_image`); `name` replaces the path in errors.
 
-    Colors are sRGB (`io/colors.py`). The upper 8 of 16 bits are kept.
+    The upper 8 of 16 bits are kept.
     """
     with refusing(f"{name} is not a readable image"):
         with _open(data, name, IMAGES) as image:
@@ -53,14 +67,14 @@ def decode_image(
                 raise InputError(f"{name} has 32 bits a channel; save it with 8 or 16.")
             if image.format == "PNG":
                 image.verify()  # checks the CRC of every chunk and consumes the file: open it again
-        if hdr := hdr_of_png(data):
-            raise InputError(f"{name} is HDR ({hdr}), which is not read. {FIX}")
+        if hdr := _hdr_of_png(data):
+            raise InputError(f"{name} is HDR ({hdr}), which is not read. {_FIX}")
         with _open(data, name, IMAGES) as image:
             turn = _orientation(image)
             image.load()
             if pixels == "shown":
                 _check_square(image, name)
-            colors = to_srgb(image, name)
+            colors = _to_srgb(image, name)
             # Pillow turns a TIFF itself, and removes the tag.
             turned = image.format == "TIFF" and _orientation(image) == 1
         if turned == (pixels == "shown"):
@@ -122,6 +136,103 @@ def _check_square(image: Image.Image, name: str) -> None:
             "not square. Resize it to square pixels, or correct its resolution, for instance by "
             "`magick IN -density 72 OUT.png`."
         )
+
+
+def _to_srgb(image: Image.Image, name: str) -> UInt8[np.ndarray, "h w 3"]:
+    """Return the colors of a loaded image. Raises `InputError` if they are not known.
+
+    The color of a partly transparent pixel is its own, without a background.
+    """
+    info = dict(image.info)
+    if image.mode.startswith("I;16"):
+        if "transparency" in info:
+            _refuse_transparent(name)
+        image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
+    elif image.has_transparency_data and not np.asarray(image.convert("RGBA"))[..., 3].all():
+        _refuse_transparent(name)
+    profile = info.get("icc_profile")
+    if profile:
+        return _convert(image, profile, name)
+    if image.mode == "CMYK":
+        raise InputError(f"{name} has CMYK colors and no color profile for them. {_FIX}")
+    if why := _other_space(image, info):
+        raise InputError(f"{name} has colors that are not sRGB: {why}. {_FIX}")
+    return np.asarray(image.convert("RGB"))
+
+
+def _hdr_of_png(data: bytes) -> str | None:
+    """Return PQ or HLG if a PNG says that it is HDR (chunk cICP)."""
+    at = 8
+    while data.startswith(b"\x89PNG") and at + 12 <= len(data):
+        (length,), kind = struct.unpack_from(">I", data, at), data[at + 4 : at + 8]
+        if kind == b"cICP" and length == 4:
+            return _HDR.get(data[at + 9])
+        if kind == b"IDAT":
+            return None
+        at += 12 + length
+    return None
+
+
+def _refuse_transparent(name: str) -> None:
+    raise InputError(
+        f"{name} has transparent pixels, which have no color: fill them, for instance by "
+        "`magick IN -background white -flatten OUT.png`."
+    )
+
+
+def _convert(image: Image.Image, profile: bytes, name: str) -> UInt8[np.ndarray, "h w 3"]:
+    """Return the colors of an image with a profile; unchanged if that is sRGB."""
+    try:
+        if len(profile) > MAX_PROFILE_BYTES:
+            raise ValueError(f"it has {len(profile):,} bytes")
+        source: Any = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        space = source.profile.xcolor_space.strip()
+        mode = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}[space]
+        if (mode == "L") > (image.mode in ("1", "L", "LA", "La")) or (
+            (mode == "CMYK") != (image.mode == "CMYK")
+        ):
+            raise ValueError(f"it is for {space}, the image has {image.mode}")
+        colors = image.convert(mode)
+        change: Any = ImageCms.buildTransform(
+            source,
+            ImageCms.createProfile("sRGB"),
+            mode,
+            "RGB",
+            renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
+            flags=ImageCms.Flags.BLACKPOINTCOMPENSATION,
+        )
+        if mode != "CMYK":
+            levels = np.arange(0, 256, 17, dtype=np.uint8)
+            axes = [levels] * (3 if mode == "RGB" else 1)
+            grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(1, -1, len(axes))
+            sample = Image.fromarray(grid if mode == "RGB" else grid[..., 0])
+            moved = np.asarray(ImageCms.applyTransform(sample, change)).astype(int)
+            if np.abs(moved - grid).max() <= SRGB_LEVELS:
+                return np.asarray(image.convert("RGB"))
+        return np.asarray(ImageCms.applyTransform(colors, change))
+    except (ImageCms.PyCMSError, OSError, ValueError, KeyError) as error:
+        raise InputError(f"{name} has a color profile that cannot be used: {error}. {_FIX}") from (
+            error
+        )
+
+
+def _other_space(image: Image.Image, info: dict[Any, Any]) -> str | None:
+    """Return what an image without a profile says of its color space, unless that is sRGB."""
+    if image.format == "PNG" or "gamma" in info or "chromaticity" in info:
+        if "srgb" in info:
+            return None
+        if (gamma := info.get("gamma")) and abs(gamma / _GAMMA - 1) > 0.05:
+            return f"their gamma is {gamma:g}, not {_GAMMA:g}"
+        primaries = info.get("chromaticity")
+        if primaries and np.abs(np.subtract(primaries, _PRIMARIES)).max() > 0.01:
+            return "the primaries are not sRGB's"
+    try:
+        exif = image.getexif()
+        adobe = exif.get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex) == "R03"
+        adobe |= exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.ColorSpace) == _ADOBE_RGB
+    except Exception:  # damaged EXIF says nothing, as in every viewer
+        return None
+    return "EXIF says Adobe RGB" if adobe else None
 
 
 def read_depth_image(path: Path) -> Float32[np.ndarray, "h w"]:

@@ -96,11 +96,7 @@ class Journal:
         finished phase is missing or changed.
         """
         if name in self.done:
-            if not output.exists() or digest(output) != self.done[name].get("sha256"):
-                raise InputError(
-                    f"{output} is not the file that phase {name} wrote: it is missing or was "
-                    f"changed. Restore it, or remove {self._folder} to start over."
-                )
+            self.verify(name, output)
             return load(output)
         then = time.monotonic()
         output.parent.mkdir(parents=True, exist_ok=True)
@@ -115,6 +111,14 @@ class Journal:
             }
         )
         return load(output)
+
+    def verify(self, name: str, output: Path) -> None:
+        """Raise `InputError` unless the file of a phase is there as the phase wrote it."""
+        if not output.exists() or digest(output) != self.done.get(name, {}).get("sha256"):
+            raise InputError(
+                f"{output} is not the file that phase {name} wrote: it is missing or was "
+                f"changed. Restore it, or remove {self._folder} to start over."
+            )
 
     def _append(self, entry: dict[str, Any]) -> None:
         self._chain = _chained(self._chain, entry)

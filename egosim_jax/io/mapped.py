@@ -1,10 +1,9 @@
 """Memory-mapped tensors of safetensors files.
 
-Our own code, because the safetensors library's NumPy reader supports neither bfloat16 nor float8.
-
-Opening a file reads only its header; values are paged in on access. Files of egosim_jax are sealed:
-the header holds the SHA-256 of each piece of each tensor and of the header itself. The header is
-verified when it is read, a tensor when its values are first accessed.
+The safetensors library reads and checks headers. Opening a file reads only its header; values are
+paged in on access, as views of the file in any dtype. Files of egosim_jax have the SHA-256 of each
+tensor, and of the names, dtypes, shapes and values of all. The header is verified when it is read,
+a tensor when its values are first accessed.
 """
 
 from __future__ import annotations
@@ -19,11 +18,13 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import ml_dtypes
 import numpy as np
+from safetensors import SafetensorError, safe_open
 
 from egosim_jax.io.bounded import (
     MAX_JSON_BYTES,
@@ -33,6 +34,7 @@ from egosim_jax.io.bounded import (
     quote_path,
     quote_text,
 )
+from egosim_jax.runtime.threads import map_ahead
 from egosim_jax.types import InputError
 
 CODES = {
@@ -51,8 +53,8 @@ POINTER = b"version https://git-lfs.github.com/spec/"
 """First bytes of a Git LFS pointer file."""
 METADATA, OURS = "__metadata__", "egosim_jax"
 """Header entry for text metadata, and the `format` in it that marks files of egosim_jax."""
-HASH, CHECKSUMS, SEAL = "sha256", "checksums", "seal"
-"""Metadata of a sealed header: hash of the weights, hashes per tensor, hash of the header."""
+HASH, CHECKSUMS = "sha256", "checksums"
+"""Metadata of our files: `weights_hash`, and SHA-256 per tensor as JSON."""
 BLANK = "0" * hashlib.sha256().digest_size * 2
 """Placeholder with the length of a hash."""
 
@@ -61,8 +63,9 @@ class RefusedError(ValueError):
     """Reason why a file cannot be read, without the file's name."""
 
 
-class TensorInfo(NamedTuple):
-    """Name, shape and dtype of a tensor to write."""
+@dataclass(frozen=True)
+class TensorInfo:
+    """Name, shape and dtype of a tensor in a header."""
 
     name: str
     shape: tuple[int, ...]
@@ -79,32 +82,27 @@ class Tensor:
     """Bytes of the file, starting at the first element."""
     strides: tuple[int, ...]
     """Byte strides per axis."""
-    checksums: tuple[str, ...] = ()
-    """SHA-256 of equal pieces; empty if the file has no checksums."""
+    checksum: str = ""
+    """SHA-256 of the values; empty if the file has no checksums."""
     origin: str = ""
     """Tensor name and file, for error messages."""
 
     def array(self) -> np.ndarray:
         """Return the values as a read-only view of the file.
 
-        The first call verifies the checksums. Raises `InputError` if they do not match.
+        The first call verifies the checksum. Raises `InputError` if it does not match.
         """
         if not self.intact:
             raise InputError(
-                f"{self.origin} is damaged: its values do not match their SHA-256 checksums. "
+                f"{self.origin} is damaged: its values do not match their SHA-256 checksum. "
                 "Copy or convert the file again."
             )
         return np.ndarray(self.shape, self.dtype, buffer=self.data, strides=self.strides)
 
     @cached_property
     def intact(self) -> bool:
-        """True if the values match their checksums, or have no checksums."""
-        if not self.checksums:
-            return True
-        step = len(self.data) // len(self.checksums)
-        parts = [self.data[i * step : (i + 1) * step] for i in range(len(self.checksums))]
-        with ThreadPoolExecutor(min(len(parts), os.cpu_count() or 1, 8)) as pool:
-            return tuple(pool.map(digest, parts)) == self.checksums
+        """True if the values match their checksum, or have none."""
+        return not self.checksum or digest(self.data) == self.checksum
 
 
 def digest(data: bytes | memoryview) -> str:
@@ -130,70 +128,74 @@ def read_safetensors(path: Path) -> dict[str, Tensor]:
     """Return the memory-mapped tensors of a safetensors file by name.
 
     Raises `InputError` if the file is damaged: every byte after the header must belong to exactly
-    one tensor, and a sealed header must match its hash.
+    one tensor, and a header of ours must match its hash.
     """
-    with _refusing(path):
-        header, body = _parts(path)
-        checksums = _checksums(header.pop(METADATA, {}))
-        if checksums and checksums.keys() != header.keys():
-            raise RefusedError("its checksums do not cover its tensors")
-        tensors = {
-            name: _tensor(name, entry, body, checksums.get(name, ""), path)
-            for name, entry in header.items()
+    with _opened(path) as (file, body):
+        infos = [_info(name, file.get_slice(name)) for name in file.offset_keys()]
+        checksums = _checksums(file.metadata() or {}, infos)
+        ends = accumulate((math.prod(i.shape) * i.dtype.itemsize for i in infos), initial=0)
+        return {
+            info.name: Tensor(
+                shape=info.shape,
+                dtype=info.dtype,
+                data=body[begin:end],
+                strides=strides_of(quote(info.name), info.shape, info.dtype),
+                checksum=checksums.get(info.name, ""),
+                origin=f"{info.name} of {quote_path(path)}",
+            )
+            for info, (begin, end) in zip(infos, pairwise(ends), strict=True)
         }
-        _check_offsets(header, len(body))
-        return tensors
+
+
+def read_arrays(tensors: Iterable[Any]) -> Iterator[Any]:
+    """Yield the arrays of tensors, or arrays, in order; threads verify the next ones meanwhile."""
+    threads = min(os.cpu_count() or 1, 8)
+    array = lambda tensor: tensor.array() if isinstance(tensor, Tensor) else tensor  # noqa: E731
+    return map_ahead(array, tensors, threads=threads, ahead=threads)
 
 
 def read_metadata(path: Path) -> dict[str, str]:
     """Return the text metadata in the header of a safetensors file."""
-    with _refusing(path):
-        return _parts(path)[0].get(METADATA, {})
+    with _opened(path) as (file, _):
+        return dict(sorted((file.metadata() or {}).items()))
 
 
 def weights_hash(tensors: Iterable[TensorInfo], digests: Mapping[str, str]) -> str:
     """Return a hash of the names, dtypes, shapes and values of weights, in the order of the names.
 
     `digests` has the SHA-256 of each tensor's bytes by name. Bit-equal weights have the same hash,
-    whatever the order, pieces and metadata of their file.
+    whatever the order and metadata of their file.
     """
     codes = {dtype: code for code, dtype in CODES.items()}
-    lines = [
-        json.dumps([name, codes[dtype], *shape, digests[name]]) for name, shape, dtype in tensors
-    ]
+    lines = [json.dumps([t.name, codes[t.dtype], *t.shape, digests[t.name]]) for t in tensors]
     return digest("\n".join(sorted(lines)).encode())
 
 
 def read_weights_hash(path: Path) -> str:
-    """Return the `weights_hash` of a file: out of a sealed header if it can be, else computed."""
+    """Return the `weights_hash` of a file: out of a header of ours, else computed."""
     tensors, metadata = read_safetensors(path), read_metadata(path)
-    if all(len(tensor.checksums) == 1 for tensor in tensors.values()):
-        digests = {name: tensor.checksums[0] for name, tensor in tensors.items()}
-    elif SEAL in metadata and HASH in metadata:
+    if CHECKSUMS in metadata:
         return metadata[HASH]
-    else:
-        with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
-            found = pool.map(digest, (tensor.data for tensor in tensors.values()))
-            digests = dict(zip(tensors, found, strict=True))
-    infos = (TensorInfo(name, t.shape, t.dtype) for name, t in tensors.items())
-    return weights_hash(infos, digests)
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
+        digests = pool.map(digest, (tensor.data for tensor in tensors.values()))
+        infos = [TensorInfo(name, t.shape, t.dtype) for name, t in tensors.items()]
+        return weights_hash(infos, dict(zip(tensors, digests, strict=True)))
 
 
 def header(
     tensors: Sequence[TensorInfo],
     metadata: Mapping[str, str],
-    checksums: Mapping[str, Sequence[str]],
-    hashed: str,
+    digests: Mapping[str, str] | None = None,
 ) -> bytes:
-    """Return the safetensors header of these tensors in this order; sealed if its format is ours.
+    """Return the safetensors header of these tensors in this order.
 
-    `hashed` is their `weights_hash`. The length does not depend on the values of the hashes.
+    With `digests`, the SHA-256 of each tensor by name, it has the hashes of a file of ours. The
+    length does not depend on their values.
     """
     codes = {dtype: code for code, dtype in CODES.items()}
     written = dict(metadata)
-    if metadata.get("format") == OURS:
-        text = {tensor.name: "".join(checksums[tensor.name]) for tensor in tensors}
-        written |= {HASH: hashed, CHECKSUMS: json.dumps(text), SEAL: BLANK}
+    if digests is not None:
+        written |= {HASH: weights_hash(tensors, digests), CHECKSUMS: json.dumps(digests)}
     listed: dict[str, Any] = {METADATA: written}
     end = 0
     for tensor in tensors:
@@ -202,90 +204,54 @@ def header(
         listed[tensor.name] = {"dtype": code, "shape": tensor.shape, "data_offsets": offsets}
     text = json.dumps(listed).encode()
     text += b" " * (-len(text) % 8)
-    # A file cannot hold its own hash: the seal is the hash of the header with a blank seal.
-    text = text.replace(_seal(BLANK), _seal(digest(text)))
     return len(text).to_bytes(8, "little") + text
 
 
-def _seal(value: str) -> bytes:
-    return f'"{SEAL}": "{value}"}}'.encode()
-
-
 @contextmanager
-def _refusing(path: Path) -> Iterator[None]:
-    """Turn a `RefusedError` into an `InputError` that names the file."""
+def _opened(path: Path) -> Iterator[tuple[Any, memoryview]]:
+    """Open a file by the safetensors library, which checks its header; yield the bytes after it.
+
+    A `RefusedError` becomes an `InputError` that names the file.
+    """
+    data = map_file(path)
     try:
-        yield
-    except RefusedError as error:
-        message = f"{quote_path(path)} is not a readable safetensors file: {error}."
+        length = int.from_bytes(data[:8], "little")
+        if length > MAX_JSON_BYTES:
+            raise RefusedError(f"its header has {length:,} bytes; the limit is {MAX_JSON_BYTES:,}")
+        with safe_open(path, "numpy") as file:
+            yield file, data[8 + length :]
+    except (RefusedError, SafetensorError) as error:
+        reason = str(error)
+        if isinstance(error, SafetensorError):
+            reason = quote_text(reason.removeprefix("Error while deserializing header: "))
+            reason += ". If it was copied or downloaded, do that again"
+        message = f"{quote_path(path)} is not a readable safetensors file: {reason}."
         raise InputError(message) from error
 
 
-def _parts(path: Path) -> tuple[dict[str, Any], memoryview]:
-    """Return the verified header and the bytes after it."""
-    data = map_file(path)
-    length = int.from_bytes(data[:8], "little")
-    if len(data) < 8 or length > len(data) - 8:
-        raise RefusedError(f"its header size, {length:,} bytes, exceeds the file")
-    if length > MAX_JSON_BYTES:
-        raise RefusedError(f"its header has {length:,} bytes; the limit is {MAX_JSON_BYTES:,}")
-    text = bytes(data[8 : 8 + length])
-    header = parse_json(text, source=f"The header of {quote_path(path)}")
-    if not isinstance(header, dict) or len(header) > MAX_TENSORS:
-        raise RefusedError(f"its header is not a JSON object of at most {MAX_TENSORS:,} tensors")
-    metadata = header.get(METADATA, {})
-    if not isinstance(metadata, dict) or not all(isinstance(v, str) for v in metadata.values()):
-        raise RefusedError(f"its {METADATA} is not a JSON object of strings")
-    seal = metadata.get(SEAL)
-    if seal is not None:
-        blank = text.replace(_seal(seal), _seal(BLANK))
-        if digest(blank) != seal:
-            raise RefusedError("its header does not match its SHA-256 seal. Copy the file again")
-    return header, data[8 + length :]
-
-
-def _checksums(metadata: Mapping[str, str]) -> dict[str, str]:
-    if (CHECKSUMS in metadata) != (SEAL in metadata):
-        raise RefusedError(f"its header has only one of {CHECKSUMS} and {SEAL}")
-    found = parse_json(metadata.get(CHECKSUMS, "{}").encode(), source=f"its {CHECKSUMS}")
-    if not isinstance(found, dict) or not all(
-        isinstance(text, str) and text and len(text) % len(BLANK) == 0 for text in found.values()
-    ):
-        raise RefusedError(f"its {CHECKSUMS} are not a JSON object of SHA-256 hashes")
-    return found
-
-
-def _tensor(name: str, entry: Any, body: memoryview, checksums: str, path: Path) -> Tensor:
+def _info(name: str, entry: Any) -> TensorInfo:
+    """Return what a header says of a tensor. Raises `RefusedError` if that is not supported."""
     check_name(name)
-    match entry:
-        case {
-            "dtype": str(code), "shape": [*shape], "data_offsets": [begin, end], **others
-        } if not others:  # fmt: skip
-            pass
-        case _:
-            raise RefusedError(f"{quote(name)} must have exactly dtype, shape and data_offsets")
+    shape, code = tuple(entry.get_shape()), entry.get_dtype()
     if code not in CODES:
         raise RefusedError(f"{quote(name)} has the unsupported dtype {quote_text(code)}")
-    dtype = CODES[code]
     if len(shape) > MAX_AXES:
         raise RefusedError(f"{quote(name)} has {len(shape)} axes; the limit is {MAX_AXES}")
-    check_sizes(quote(name), (begin, end, *shape))
-    strides = strides_of(quote(name), tuple(shape), dtype)
-    if not begin <= end <= len(body) or end - begin != math.prod(shape) * dtype.itemsize:
-        raise RefusedError(
-            f"{quote(name)}, {code} of shape {quote_text(str(shape))}, has data_offsets "
-            f"{begin} to {end} of {len(body)} bytes: not its size, or outside the file"
-        )
-    return Tensor(
-        shape=tuple(shape),
-        dtype=dtype,
-        data=body[begin:end],
-        strides=strides,
-        checksums=tuple(
-            checksums[i : i + len(BLANK)] for i in range(0, len(checksums), len(BLANK))
-        ),
-        origin=f"{name} of {quote_path(path)}",
-    )
+    return TensorInfo(name, shape, CODES[code])
+
+
+def _checksums(metadata: Mapping[str, str], infos: Sequence[TensorInfo]) -> dict[str, str]:
+    """Return the checksums in a header by name, verified by its hash; empty if it has none."""
+    if CHECKSUMS not in metadata:
+        return {}
+    checksums = parse_json(metadata[CHECKSUMS].encode(), source=f"its {CHECKSUMS}")
+    if (
+        not isinstance(checksums, dict)
+        or checksums.keys() != {info.name for info in infos}
+        or weights_hash(infos, checksums) != metadata.get(HASH)
+    ):
+        raise RefusedError("its header does not match its SHA-256. Copy or convert it again")
+    return checksums
 
 
 def check_name(name: str) -> None:
@@ -312,16 +278,3 @@ def strides_of(owner: str, shape: tuple[int, ...], dtype: np.dtype) -> tuple[int
     if step > MAX_BYTES:
         raise RefusedError(f"{owner} has more than {MAX_BYTES:,} bytes")
     return tuple(reversed(strides))
-
-
-def _check_offsets(header: Mapping[str, Any], size: int) -> None:
-    """Raise `RefusedError` unless the tensors are contiguous up to the end of the file."""
-    offsets = sorted((*entry["data_offsets"], name) for name, entry in header.items())
-    end = 0
-    for begin, following, name in (*offsets, (size, size, "end of file")):
-        if begin != end:
-            raise RefusedError(
-                f"{quote(name)} begins at byte {begin} where {end} is expected: tensors may "
-                "neither overlap nor leave holes"
-            )
-        end = following

@@ -71,7 +71,7 @@ def environment() -> dict[str, Any]:
 
 
 def _version(package: str) -> str | None:
-    """Return the version of a package; None if it is not installed, such as in a bundle."""
+    """Return the version of a package; None if it is not installed."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -93,22 +93,24 @@ def _commit() -> str | None:
     return commit if Path(toplevel).resolve() == root else None
 
 
-def open_folder(folder: Path, config: Any, *, mutable: Collection[str] = ()) -> None:
+def open_folder(
+    folder: Path, config: Any, *, mutable: Collection[str] = (), begun: bool = True
+) -> None:
     """Create a run folder with config and environment, or resume in one with an equal config.
 
     The folder is locked until the process ends. Fields named `out` are not compared, so that a
     folder can be moved. Fields whose dotted paths are in `mutable`, or below, are not compared
-    either. All processes of a run call this: the first locks, compares and writes, then the others
-    compare; what the first one refuses, all refuse. Raises `InputError` when the folder cannot be
-    written, is in use, lost its config, or holds a run of another config, naming the fields that
-    differ.
+    either, and a folder whose run has not `begun` takes any config. All processes of a run call
+    this: the first locks, compares and writes, then the others compare with it; what the first one
+    refuses, all refuse. Raises `InputError` when the folder cannot be written, is in use, lost its
+    config, or holds a run of another config, naming the fields that differ.
     """
     import jax
 
     refusal = ""
     if jax.process_index() == 0:
         try:
-            _begin(folder, config, mutable)
+            _begin(folder, config, mutable if begun else None)
         except InputError as error:
             refusal = str(error)
     if jax.process_count() > 1:
@@ -128,8 +130,8 @@ def _of_the_first_process(text: str) -> str:
     return np.asarray(shared, np.uint8).tobytes().rstrip(b"\0").decode("utf-8", "ignore")
 
 
-def _begin(folder: Path, config: Any, mutable: Collection[str]) -> None:
-    """Lock a folder, compare its config and write this run's."""
+def _begin(folder: Path, config: Any, mutable: Collection[str] | None) -> None:
+    """Lock a folder, compare its config, unless all is mutable (None), and write this run's."""
     try:
         hold_folder(folder)
         is_known = (folder / CONFIG).exists()
@@ -140,7 +142,8 @@ def _begin(folder: Path, config: Any, mutable: Collection[str]) -> None:
             f"{folder / CONFIG} is missing, although {folder} holds a run: its config is unknown. "
             "Restore the file, or choose another --out."
         )
-    _compare(folder, config, mutable)
+    if mutable is not None:
+        _compare(folder, config, mutable)
     write_json(folder / CONFIG, config)
     write_json(folder / ENVIRONMENT, environment())
 

@@ -25,8 +25,12 @@ logger = logging.getLogger(__name__)
 
 MAX_DISTANCE_S = 0.1
 """Maximum time from a moment to its nearest frame in seconds, if one frame period is not longer."""
+MAX_RATE_RATIO = Fraction(101, 100)
+"""Maximum ratio of frame rates that count as equal, such as 30 and 29.97."""
 CONVERT = "ffmpeg -i IN -vf fps={} OUT"
 """Command that writes a video at a constant frame rate."""
+UNITS = {"milliseconds": 10**3, "microseconds": 10**6, "nanoseconds": 10**9}
+"""Units that hardware gives time stamps in, and their number in a second."""
 _EPSILON_S = 1e-6
 _ROW_S = 1e-4
 """Precision of time stamps in tables in seconds, as in LeRobot."""
@@ -132,11 +136,19 @@ def row_times(
 ) -> tuple[Int[np.ndarray, " f"], float, Timeline]:
     """Return the rows of a table in order of time, the first time in seconds, and their timeline.
 
-    `stamps` are the values of a column, in seconds. Rows without a time stamp or with a repeated
-    one are dropped, and a warning names them. Raises `InputError` if no row has a time stamp.
+    `stamps` are the values of a column, in seconds, and `rates` are declared rates. Rows without a
+    time stamp or with a repeated one are dropped, and a warning names them. If no two rows have
+    different ones, the declared rate gives the times. Raises `InputError` if it is unknown, too,
+    and for time stamps in another unit.
     """
     numbers = np.array([_seconds(stamp) for stamp in stamps], float)
     given = np.flatnonzero(np.isfinite(numbers))
+    rate = next(filter(None, rates), None)
+    if rate and len(numbers) > 1 and len(np.unique(numbers[given])) < 2:
+        logger.warning(
+            "%s does not separate %d rows: row k is at k / %g s", name, len(numbers), float(rate)
+        )
+        return np.arange(len(numbers)), 0.0, Timeline.even(len(numbers), rate)
     if not len(given):
         raise InputError(
             f"{name} has no time stamps: a row must have a finite number of seconds. Write them, "
@@ -150,6 +162,13 @@ def row_times(
             "one is row %d", name, len(dropped), len(numbers), dropped[0],
         )  # fmt: skip
     timeline = Timeline.of((ordered / _ROW_S).tolist(), Fraction(_ROW_S), rates)
+    for unit, count in UNITS.items():
+        if rate and count / 2 < rate / timeline.fps < 2 * count:
+            raise InputError(
+                f"{name} seems to be in {unit}: its rows are {float(1 / timeline.fps):.4g} apart, "
+                f"at {float(rate):g} frames per second. It must be in seconds: divide it by "
+                f"{count:,}."
+            )
     timeline.check(name, fix="Cut it there, and use the parts.")
     timeline.report(name)
     return given[first], float(ordered[0]), timeline
@@ -158,7 +177,7 @@ def row_times(
 def _seconds(value: Any) -> float:
     if isinstance(value, list) and len(value) == 1:
         (value,) = value
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e12:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e19:
         return float("nan")
     return float(value)
 

@@ -7,6 +7,8 @@ differences between a file and a network. `convert` reads the checkpoints of oth
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Collection, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -14,19 +16,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from egosim_jax.io.atomic import atomic_write
-from egosim_jax.io.bounded import listing, quote, quote_path
+from egosim_jax.io.atomic import atomic_folder, atomic_write
+from egosim_jax.io.bounded import listing, quote, quote_path, quote_text, read_json
 from egosim_jax.io.mapped import (
     OURS,
     Tensor,
     TensorInfo,
     digest,
     header,
+    read_arrays,
     read_metadata,
     read_safetensors,
     read_weights_hash,
-    weights_hash,
 )
+from egosim_jax.io.run import write_json
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -37,6 +40,8 @@ STUDENT = "student.safetensors"
 """Name of the LoRA in a weights folder that makes its denoiser a causal student."""
 CHUNKS = "chunks"
 """Metadata of a denoiser that is a causal student: the latent frames of its chunks."""
+RECORD = "hashes.json"
+"""Name of the file with the hashes of the networks that a weights folder has from another one."""
 MAX_LISTED = 12
 """Maximum number of mismatches in an error message."""
 
@@ -99,9 +104,9 @@ def fill(
 
     state = nnx.state(module, nnx.Not(nnx.RngState))
     where = {} if mesh is None else dict(nnx.to_flat_state(state_sharding(mesh, state)))
-    for path, leaf in nnx.to_flat_state(state):
-        tensor = tensors[".".join(map(str, path))]
-        tensor = tensor.array() if isinstance(tensor, Tensor) else tensor
+    leaves = nnx.to_flat_state(state)
+    arrays = read_arrays(tensors[".".join(map(str, path))] for path, _ in leaves)
+    for (path, leaf), tensor in zip(leaves, arrays, strict=True):
         if mesh is None:
             # A copy, since the file may be mapped; `jnp.array` would compile one for each shape.
             value = jax.device_put(np.array(tensor))
@@ -119,7 +124,8 @@ def hashes(
     """Return a hash per network in a weights folder, or per network in `only`.
 
     Bit-equal weights have the same hash (`weights_hash`). A student in the folder of its teacher
-    counts only with `student`: what the teacher alone makes does not depend on it.
+    counts only with `student`: what the teacher alone makes does not depend on it. Raises
+    `InputError` for a file that is not the one that `add_others` recorded.
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a weights folder. (--weights)")
@@ -128,7 +134,29 @@ def hashes(
         for path in sorted(folder.glob("[!.]*.safetensors"))  # hidden files are incomplete
         if (path.stem in only if only is not None else student or path.name != STUDENT)
     ]
-    return {path.stem: read_weights_hash(path) for path in files}
+    digests = {path.stem: read_weights_hash(_linked(path)) for path in files}
+    for name, recorded in _record(folder).items():
+        if digests.get(name, recorded) != recorded:
+            raise InputError(
+                f"{quote_path(folder / name)}.safetensors has the hash {digests[name][:12]}…, but "
+                f"the folder was made with {quote_text(str(recorded)[:12])}…: it was replaced. "
+                f"Put the file back, or remove {RECORD} if the change is right. (--weights)"
+            )
+    return digests
+
+
+def check_record(folder: Path, names: Collection[str]) -> None:
+    """Raise `InputError` if a network in `names` is not the one that a folder was made with."""
+    if recorded := names & _record(folder).keys():
+        hashes(folder, only=recorded)
+
+
+def _record(folder: Path) -> dict[str, Any]:
+    """Return the hashes of the networks that a folder has from another one."""
+    record = read_json(folder / RECORD) if (folder / RECORD).exists() else {}
+    if not isinstance(record, dict):
+        raise InputError(f"{quote_path(folder / RECORD)} is not a JSON object of hashes.")
+    return record
 
 
 def save(
@@ -164,20 +192,46 @@ def write(
     infos = [TensorInfo(name, arrays[name].shape, arrays[name].dtype) for name in names]
     metadata = {"format": OURS, **(metadata or {})}
     with atomic_write(path) as temporary, temporary.open("wb") as file:
-        digests = {name: digest(bytes_of[name]) for name in names}
-        checksums = {name: [digests[name]] for name in names}
-        file.write(header(infos, metadata, checksums, weights_hash(infos, digests)))
+        file.write(header(infos, metadata, {name: digest(bytes_of[name]) for name in names}))
         for name in names:
             file.write(bytes_of[name])
 
 
-def link_others(folder: Path, origin: Path) -> None:
-    """Symlink the networks and tokenizer of `origin` that a weights folder lacks."""
-    for path in origin.glob("[!.]*"):
-        link = folder / path.name
-        kept = path.is_dir() or path.suffix == ".safetensors"
-        if kept and not link.exists() and not path.name.startswith("."):
-            link.symlink_to(path.resolve())
+def add_others(folder: Path, origin: Path) -> None:
+    """Give a weights folder the networks and tokenizer of `origin` that it lacks; record hashes."""
+    paths = [path for path in sorted(origin.glob("[!.]*")) if not (folder / path.name).exists()]
+    files = [path for path in paths if path.suffix == ".safetensors" and not path.is_dir()]
+    # Before the files: whatever is here if this stops has its hash.
+    new = {path.stem: read_weights_hash(_linked(path)) for path in files if path.name != STUDENT}
+    write_json(folder / RECORD, _record(folder) | new)
+    for path in files:
+        link_or_copy(path, folder / path.name)
+    for path in (path for path in paths if path.is_dir()):
+        with atomic_folder(folder / path.name) as temporary:
+            shutil.copytree(path, temporary, dirs_exist_ok=True)
+
+
+def link_or_copy(source: Path, path: Path) -> None:
+    """Make a file the same as another: a hard link, which takes no space, or a copy.
+
+    Unlike a symlink it can be copied with its folder, and stays if `source` is replaced.
+    """
+    with atomic_write(path) as temporary:
+        temporary.unlink()
+        try:
+            os.link(source.resolve(), temporary)
+        except OSError:  # on another disk
+            shutil.copyfile(source, temporary)
+
+
+def _linked(path: Path) -> Path:
+    """Return the path. Raises `InputError` naming its target if it is a link to nothing."""
+    if path.is_symlink() and not path.exists():
+        raise InputError(
+            f"{quote_path(path)} is a link to {quote_path(os.readlink(path))}, which does not "
+            "exist. Put that file back, or copy it to the place of the link. (--weights)"
+        )
+    return path
 
 
 def gather(array: Any) -> np.ndarray | None:
@@ -215,19 +269,19 @@ def place(folder: Path, abstract: nnx.State, shardings: nnx.State) -> nnx.State:
         shapes = {name: tuple(leaf.shape) for name, (_, leaf) in wanted.items()}
         if problems := mismatches(tensors, shapes):
             raise WeightsError(problems, source=str(file))
-        for name, (path, leaf) in wanted.items():
-            array, dtype = tensors[name].array(), leaf.dtype
+        arrays = read_arrays(tensors[name] for name in wanted)
+        for (path, leaf), array in zip(wanted.values(), arrays, strict=True):
             value = jax.make_array_from_callback(
                 array.shape,
                 where[path].get_value(),
-                lambda part, array=array, dtype=dtype: array[part].astype(dtype),
+                lambda part, array=array, dtype=leaf.dtype: array[part].astype(dtype),
             )
             placed.append((path, leaf.replace(value)))
     return nnx.from_flat_state(placed)
 
 
 def _read(path: Path) -> dict[str, Tensor]:
-    if not path.is_file():
+    if not _linked(path).is_file():
         raise _absent(path)
     return read_safetensors(path)
 
@@ -238,7 +292,7 @@ def student_of(file: Path, metadata: Mapping[str, str]) -> Path | None:
     `metadata` is the wanted student's. Raises `InputError` unless the file itself or the LoRA makes
     the wanted chunks.
     """
-    wanted, student = metadata.get(CHUNKS), file.with_name(STUDENT)
+    wanted, student = metadata.get(CHUNKS), _linked(_linked(file).with_name(STUDENT))
     if wanted is None or read_metadata(file).get(CHUNKS) == wanted or not student.is_file():
         check_chunks(file, wanted)
         return None
@@ -249,14 +303,14 @@ def student_of(file: Path, metadata: Mapping[str, str]) -> Path | None:
 
 def check_chunks(file: Path, wanted: str | None) -> None:
     """Raise `InputError` unless a file's denoiser makes these chunks; None: clips at once."""
-    found = read_metadata(file).get(CHUNKS)
-    if found == wanted:
+    chunks = read_metadata(_linked(file)).get(CHUNKS)
+    if chunks == wanted:
         return
     has, needs = (
         "a denoiser of whole clips"
-        if chunks is None
-        else f"a causal student with chunks of {quote(chunks)} latent frames"
-        for chunks in (found, wanted)
+        if sizes is None
+        else f"a causal student with chunks of {quote(sizes)} latent frames"
+        for sizes in (chunks, wanted)
     )
     raise InputError(
         f"{quote_path(file)} is {has}; the config needs {needs}. Give weights of this config, or "
@@ -266,7 +320,7 @@ def check_chunks(file: Path, wanted: str | None) -> None:
 
 def check_folder(folder: Path, config: str) -> None:
     """Raise `InputError` if a folder has no denoiser of ours, with the command that converts it."""
-    if not (file := folder / "dit.safetensors").is_file():
+    if not _linked(file := folder / "dit.safetensors").is_file():
         raise _absent(file, config)
 
 
@@ -294,7 +348,7 @@ def _absent(path: Path, config: str = "CONFIG") -> InputError:
 def _is_foreign(path: Path) -> bool:
     """Return True for a file of weights in the format of another project."""
     if path.suffix != ".safetensors":
-        return path.suffix in (".pth", ".pt", ".bin")
+        return path.suffix in (".pth", ".pt", ".bin", ".ckpt")
     try:
         return read_metadata(path).get("format") != OURS
     except InputError:

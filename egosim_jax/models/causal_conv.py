@@ -10,8 +10,7 @@ channels, with the frames' channels side by side. The CPU is also slow at the gr
     dW[k, s] = sum_(t, p) x[t + k, p + s] dy[t, p]
 
 which is computed here as a product of matrices, one frame of x at a time: its shifted copies side
-by side times the frames of dy that it reaches. `tests/benchmarks/bench_causal_conv.py` compares
-the forms.
+by side times the frames of dy that it reaches.
 """
 
 from __future__ import annotations

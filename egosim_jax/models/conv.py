@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from einops import rearrange
@@ -10,6 +12,7 @@ from jaxtyping import Array, Float
 
 from egosim_jax.models.causal_conv import convolve
 from egosim_jax.models.layers import Initializer, lecun_normal
+from egosim_jax.types import InputError
 
 
 class Conv(nnx.Module):
@@ -48,3 +51,19 @@ class Conv(nnx.Module):
         )
         y = rearrange(y, "(b f) h w o -> b f h w o", b=x.shape[0])
         return y + self.bias[...].astype(self.dtype)
+
+
+def check_video(video: Array, *, stride: int, check_frames: Callable[[int], None]) -> None:
+    """Raise `InputError` unless a video has floats, frames that fit, and whole latent cells."""
+    if not jnp.issubdtype(video.dtype, jnp.floating):
+        raise InputError(
+            f"A video of {video.dtype} cannot be encoded: values must be floats from -1 to 1. "
+            "For uint8 frames: frames / 127.5 - 1."
+        )
+    _, frames, height, width, _ = video.shape
+    check_frames(frames)
+    if height % stride or width % stride:
+        raise InputError(
+            f"A video of {height} x {width} pixels cannot be encoded: rows and columns must "
+            f"be multiples of {stride}. Resize or crop it."
+        )

@@ -24,7 +24,7 @@ from jaxtyping import Float
 
 from egosim_jax.io.bounded import listing, quote_path, quote_text
 from egosim_jax.io.mapped import OURS, read_metadata, read_safetensors
-from egosim_jax.io.weights import WeightsError, flat_shapes, mismatches
+from egosim_jax.io.weights import flat_shapes
 from egosim_jax.models.layers import Linear, LowRank, LowRankParam
 from egosim_jax.types import InputError
 
@@ -187,24 +187,82 @@ def metadata(config: str, *, base: str) -> dict[str, str]:
     return {"format": OURS, "config": config, BASE: base}
 
 
-def state_of(path: Path, abstract: nnx.State) -> nnx.State:
-    """Return the low-rank weights of networks from a file of the denoiser's LoRA.
+def read_own(path: Path, *, convert: str) -> dict[str, Change]:
+    """Return the changes of one of our files.
 
-    Raises `InputError` unless the file has exactly the low-rank weights of `abstract`.
+    Raises `InputError` for a LoRA in another format; `convert` is the command that writes ours.
     """
-    leaves = [item for item in nnx.to_flat_state(abstract) if isinstance(item[1], LowRankParam)]
-    # A path in a file has no names of the network and of the layer's low-rank part.
-    wanted = {".".join(map(str, (*path[1:-2], path[-1]))): (path, leaf) for path, leaf in leaves}
-    tensors = read_safetensors(path)
-    shapes = {name: tuple(leaf.shape) for name, (_, leaf) in wanted.items()}
-    if problems := mismatches(tensors, shapes):
-        raise WeightsError(problems, source=str(path))
-    return nnx.from_flat_state(
-        [
-            (where, leaf.replace(jnp.asarray(tensors[name].array(), jnp.float32)))
-            for name, (where, leaf) in wanted.items()
-        ]
-    )
+    if path.is_dir() or path.suffix != ".safetensors" or read_metadata(path).get("format") != OURS:
+        raise InputError(
+            f"{quote_path(path)} is a LoRA in the names of another project. Write it in ours, and "
+            f"give the new file: {convert} (--lora)"
+        )
+    return from_tensors({name: t.array() for name, t in read_safetensors(path).items()})
+
+
+def check_further(changes: Mapping[str, Change], abstract: nnx.State) -> None:
+    """Raise `InputError` unless changes are of weights that `abstract`, a training's, has.
+
+    A lower rank is no error.
+    """
+    leaves, problems = _leaves(abstract), []
+    for path, change in changes.items():
+        shapes = [leaf.shape for _, (_, leaf) in sorted(leaves.get(path, {}).items())]
+        if len(shapes) != (2 if isinstance(change, Delta) else 1):
+            problems.append(f"{path}: is not trained here")
+        elif isinstance(change, Delta):
+            (*stacked, wide, rank), (*_, out) = shapes
+            kernel = {f"{path}.kernel": (*stacked, wide, out)}
+            why = misfit(kernel, path, change.down.shape, change.up.shape)
+            if why is None and (has := change.down.shape[-1]) > rank:
+                why = f"has rank {has}; the training has {rank} (--rank)"
+            problems += [f"{path}: {why}"] if why else []
+        else:
+            have = (change.array if isinstance(change, Value) else change).shape
+            problems += [] if have == shapes[0] else [f"{path}: has shape {have}, not {shapes[0]}"]
+    if problems:
+        raise InputError(
+            f"The LoRA cannot be trained further: {listing(problems)}. Train with its rank and "
+            "model, or merge it into the weights. (--lora, egosim convert lora --merge)"
+        )
+
+
+def state_of(changes: Mapping[str, Change], abstract: nnx.State, base: nnx.State) -> nnx.State:
+    """Return the weights that a training with the weights `abstract` continues a LoRA from.
+
+    `base` has the weights before the LoRA. Layers, blocks and ranks without a change start as in
+    `start`.
+    """
+    before, trained, state = dict(nnx.to_flat_state(base)), _leaves(abstract), []
+    rng = np.random.default_rng(0)
+    for path, change in changes.items():
+        keys, leaves = zip(*(leaf for _, leaf in sorted(trained[path].items())), strict=True)
+        if isinstance(change, Delta):
+            down, up = (np.zeros(tuple(leaf.shape), np.float32) for leaf in leaves)
+            *_, wide, rank = change.down.shape
+            bound = wide**-0.5
+            down[..., :rank], up[..., :rank, :] = change.down, change.up
+            # Where both factors are 0, so are their gradients: it would never learn.
+            empty = ~(down.any(axis=-2, keepdims=True) | np.any(up, axis=-1)[..., None, :])
+            down = np.where(empty, rng.uniform(-bound, bound, down.shape), down)
+            arrays = [jnp.asarray(array, jnp.float32) for array in (down, up)]
+        elif isinstance(change, Value):
+            arrays = [jnp.asarray(change.array, jnp.float32)]
+        else:
+            arrays = [before[keys[0]].get_value() + change]
+        state += [(k, leaf.replace(a)) for k, leaf, a in zip(keys, leaves, arrays, strict=True)]
+    return nnx.from_flat_state(state)
+
+
+def _leaves(abstract: nnx.State) -> dict[str, dict[str, tuple[Any, nnx.Variable]]]:
+    """Return the trained weights by the path that they have in a file: `down` and `up`, or one."""
+    leaves: dict[str, dict[str, tuple[Any, nnx.Variable]]] = {}
+    for key, leaf in nnx.to_flat_state(abstract):
+        # A path in a file has no names of the network and of the layer's low-rank part.
+        low = isinstance(leaf, LowRankParam)
+        path = ".".join(map(str, key[1:-2] if low else key[1:]))
+        leaves.setdefault(path, {})[str(key[-1]) if low else ""] = key, leaf
+    return leaves
 
 
 def start(

@@ -8,8 +8,13 @@ module but those in `networks` imports jax or torch.
     Stage:        one step, which adds fields to the observation
     Observation:  the results of the stages so far
 
-`registry` has the pipelines by name: `classical`, `networks`, `oracle`, `recorded`. `estimates` has
-the Protocols of the estimators in `cameras`, `depth`, `hands` and `networks`.
+    clip/       judges the predicted motion by a clip in a known state; new surfaces
+    objects/    finds objects without an id: growth, and how far they reach
+    video/      a recorded video from nothing: cameras, depth, hands, scale, background
+    networks/   networks in child processes
+
+`registry` has the pipelines by name: `classical`, `networks`, `oracle`, `recorded`.
+`video.estimates` has the Protocols of the estimators in `video` and `networks`.
 """
 
 from egosim_jax.perception.pipeline import Observation, Perception, Pipeline, Stage

@@ -30,7 +30,7 @@ def save(path: Path, perceived: Perceived) -> None:
         "names": {str(number): name for number, name in sorted(perceived.names.items())},
         "size": [perceived.cameras.height, perceived.cameras.width],
         "tracked": tracked,
-        "new": {str(number): len(found) for number, found in sorted(new.items())},
+        "new": {str(number): len(points) for number, points in sorted(new.items())},
         "held": {str(hand): number for hand, number in sorted(perceived.held.items())},
         "notes": list(perceived.notes),
     }

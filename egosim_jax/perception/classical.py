@@ -3,8 +3,8 @@
 Cameras and hand joints are the generator's inputs. The stages then run in this order:
 
     HandMasks          draws hands and arms from the joints
-    TrackObjects       finds the motion of a held object that best explains the clip's colors
-    MovedObjects       sets the ids of the object where it moved
+    TrackObjects       predicts the motion of the objects, and judges it by the clip's colors
+    MovedObjects       sets the ids of the objects where they moved
     NewSurfaces        continues planes of the state where it has no points
 
 Depth is set only where the clip differs from the view of the previous state. Elsewhere depth is
@@ -13,7 +13,7 @@ unknown, and the state does not change.
 A hand that closes on something without an id makes it a new object (`growth`), if the clip shows
 that it moves with the hand.
 
-Limits: one hand at a time moves an object, and objects do not topple.
+Limit: objects do not topple.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from typing import ClassVar
 import numpy as np
 
 from egosim_jax.geometry import cameras_in_object_frame
-from egosim_jax.perception.new_surfaces import NewSurfaces
-from egosim_jax.perception.object_motion import TrackObjects
+from egosim_jax.perception.clip.new_surfaces import NewSurfaces
+from egosim_jax.perception.clip.object_motion import TrackObjects
 from egosim_jax.perception.pipeline import Observation, Pipeline
 from egosim_jax.perception.registry import register
-from egosim_jax.perception.silhouettes import HandShape, hand_silhouette
+from egosim_jax.perception.video.silhouettes import HandShape, hand_silhouette
 from egosim_jax.rendering.reference import splat
-from egosim_jax.types import Action, Clip, SceneState, check_counts
+from egosim_jax.types import Action, Clip, Counted, SceneState
 
 
 def take_action(clip: Clip, action: Action, state: SceneState, so_far: Observation) -> Observation:
@@ -54,7 +54,7 @@ class HandMasks(HandShape):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MovedObjects:
+class MovedObjects(Counted):
     """Stage that sets the ids of moved objects.
 
     Their depth stays unknown. Their points move with them, and a point that is as large as a pixel
@@ -63,10 +63,6 @@ class MovedObjects:
 
     point_px: int = 2
     """Size of the state's rendered points, in pixels."""
-
-    def __post_init__(self) -> None:
-        """Check that points have a size."""
-        check_counts({"point_px": self.point_px})
 
     def __call__(
         self, clip: Clip, action: Action, state: SceneState, so_far: Observation
@@ -99,7 +95,7 @@ class ClassicalConfig:
     hands: HandMasks = field(default_factory=HandMasks)
     """Drawing of hands and arms."""
     motion: TrackObjects = field(default_factory=TrackObjects)
-    """Estimation of the motion of held objects."""
+    """Judgment of the predicted motion of objects."""
     moved: MovedObjects = field(default_factory=MovedObjects)
     """Depth of moved objects."""
     new: NewSurfaces = field(default_factory=NewSurfaces)

@@ -76,8 +76,8 @@ class Observation:
         Raises `InputError` naming the first required field that no stage has set.
         """
         fields = ("cameras", "depth_m", "object_ids", "names", "motions", "interacted_frames")
-        found = {field: self.require(field, "Perceived") for field in fields}
-        depth_m, motions = found["depth_m"], found.pop("motions")
+        values = {field: self.require(field, "Perceived") for field in fields}
+        depth_m, motions = values["depth_m"], values.pop("motions")
         return Perceived(
             step=state.step + 1,
             frames=clip.frames,
@@ -89,9 +89,9 @@ class Observation:
                 for number, motion in motions.items()
             },
             **{
-                **found,
+                **values,
                 "depth_m": np.where(np.isnan(depth_m), np.inf, depth_m).astype(np.float32),
-                "object_ids": found["object_ids"].astype(np.int32),
+                "object_ids": values["object_ids"].astype(np.int32),
             },
         )
 
@@ -135,8 +135,8 @@ def find_interactions(
     ids, depth, names = (
         so_far.require(field, "find_interactions") for field in ("object_ids", "depth_m", "names")
     )
-    found = interacted_frames(ids, depth, {**state.names, **names})
-    return replace(so_far, interacted_frames=found)
+    interactions = interacted_frames(ids, depth, {**state.names, **names})
+    return replace(so_far, interacted_frames=interactions)
 
 
 def _check_shapes(so_far: Observation, clip: Clip, stage: Stage) -> None:

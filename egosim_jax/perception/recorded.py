@@ -151,13 +151,13 @@ class ReadRecording:
     def _phrases(self, step: int) -> dict[int, str]:
         path = self._path("mask", "txt", step)
         text = read_bytes(path, limit=MAX_TEXT_BYTES).decode("utf-8-sig", "replace")
-        found = {}
+        phrases = {}
         for line in text.splitlines():
             number, colon, phrase = line.partition(":")
             if not colon or not (number.strip().isascii() and number.strip().isdigit()):
                 raise InputError(f"{path}: each line must be `id: phrase`, not {quote(line)}.")
-            found[int(number[:18])] = phrase.strip()
-        return found
+            phrases[int(number[:18])] = phrase.strip()
+        return phrases
 
     def _frames(self, kind: str, step: int, clip: Clip, *size: int) -> Float[np.ndarray, "f ..."]:
         """Return the rows of an npz file: one of the given size for each frame of the clip."""

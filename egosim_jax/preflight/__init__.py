@@ -3,7 +3,6 @@
 Callers pass the program: nothing here knows models or training.
 
     targets   target machines
-    report    memory, collectives and roofline time, and whether it fits
-    hlo       memory traffic and collectives, from the HLO text
+    report    memory, FLOPs and roofline time, and whether it fits
     flops     FLOPs of a traced program
 """

@@ -1,21 +1,18 @@
-"""Report of a compiled program on its target: memory, collectives and roofline time."""
+"""Report of a compiled program on its target: memory, FLOPs and roofline time."""
 
 from __future__ import annotations
 
 import math
 import re
 import time
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import jax
 
 from egosim_jax.preflight import flops
-from egosim_jax.preflight.hlo import CollectiveTraffic, HloModule, LargeArray
 from egosim_jax.preflight.targets import GIB, Target
 
-LARGEST = 10
 _NEEDS = (
     re.compile(r"Used ([\d.]+)([GMK]) of ([\d.]+)([GMK]) hbm"),
     re.compile(r"\(([\d.]+)([GMK])\) exceeds available HBM \(([\d.]+)([GMK])\)"),
@@ -52,20 +49,12 @@ class Report:
     """Bytes of a device that a program may use."""
     memory: Memory
     """Memory that the program uses."""
-    largest: Sequence[LargeArray]
-    """Largest arrays on a device."""
-    collectives: Mapping[str, CollectiveTraffic]
-    """Traffic of a device by kind of collective."""
     model_flops: float
     """FLOPs that the model requires, on all devices; NaN if not counted."""
     hardware_flops: float
     """FLOPs that the program executes, on all devices, including rematerialization."""
-    compute_s: float
-    """Seconds for the FLOPs at the devices' peak."""
-    memory_s: float
-    """Seconds for the memory traffic, if every operation reads and writes memory once."""
-    link_s: float
-    """Seconds for the collectives."""
+    roofline_s: float
+    """Seconds for the FLOPs at the devices' peak, a lower bound; NaN if the peak is unknown."""
     compile_s: float
     """Compilation time in seconds."""
 
@@ -73,16 +62,6 @@ class Report:
     def fits(self) -> bool:
         """Return whether the peak fits the device's memory."""
         return self.memory.peak <= self.capacity
-
-    @property
-    def max_mfu(self) -> float:
-        """Return the model FLOPs utilization of a run at `roofline_s`."""
-        return self.model_flops / self.hardware_flops * self.compute_s / self.roofline_s
-
-    @property
-    def roofline_s(self) -> float:
-        """Return the roofline time: the longest of the three times, if they overlap fully."""
-        return max(self.compute_s, self.memory_s, self.link_s)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,9 +113,8 @@ def inspect(
 
     `resident` is the size in bytes of other data on the device, such as all networks' weights.
     """
-    module, stats = HloModule.read(compiled.as_text()), compiled.memory_analysis()
+    stats = compiled.memory_analysis()
     device, count = target.device, len(target.devices)
-    collectives = module.collectives()
     results = stats.output_size_in_bytes - stats.alias_size_in_bytes
     temporaries = stats.temp_size_in_bytes
     if device.platform == "tpu":  # its temporaries include donated arguments
@@ -150,13 +128,9 @@ def inspect(
             results=results,
             temporaries=temporaries,
         ),
-        largest=module.largest(LARGEST),
-        collectives=collectives,
         model_flops=model_flops,
         hardware_flops=hardware_flops,
-        compute_s=hardware_flops / count / device.flops,
-        memory_s=module.traffic() / device.bandwidth,
-        link_s=sum(traffic.bytes for traffic in collectives.values()) / device.link,
+        roofline_s=hardware_flops / count / device.flops,
         compile_s=compile_s,
     )
 
@@ -190,20 +164,9 @@ def text(report: Report | OutOfMemory) -> str:
     lines = ["  memory of a device"]
     lines += [f"    {name:<14}{size(bytes_)}   {what}" for name, bytes_, what in rows]
     lines += [f"    {'peak':<14}{size(memory.peak)}   of {size(report.capacity)}: {verdict}"]
-    lines += ["", "  largest arrays"]
-    lines += [f"    {_array(array)}" for array in report.largest]
-    if report.collectives:
-        lines += ["", "  collectives of a device: count, bytes sent"]
-        lines += [
-            f"    {kind:<20}{traffic.count:8d}   {size(traffic.bytes)}"
-            for kind, traffic in report.collectives.items()
-        ]
     lines += ["", f"  {'work':<16}{_work(report)}"]
     if not math.isnan(report.roofline_s):
-        lines.append(
-            f"  {'roofline s':<16}compute {report.compute_s:.4g}, memory {report.memory_s:.4g}, "
-            f"interconnect {report.link_s:.4g}"
-        )
+        lines.append(f"  {'roofline s':<16}{report.roofline_s:.4g}")
     return "\n".join([*lines, f"  {'compiled in':<16}{report.compile_s:.1f} s"])
 
 
@@ -215,11 +178,9 @@ def size(bytes_: int | float) -> str:
 
 def _work(report: Report) -> str:
     """Format the FLOPs executed, and those that the model requires."""
-    done = _flops(report.hardware_flops)
-    if math.isnan(report.model_flops):
-        return done
-    most = f", MFU at most {report.max_mfu:.1%}" if not math.isnan(report.roofline_s) else ""
-    return f"{done} executed, {_flops(report.model_flops)} required by the model{most}"
+    done, needed = _flops(report.hardware_flops), report.model_flops
+    most = "" if math.isnan(needed) else f", {_flops(needed)} required by the model"
+    return f"{done} executed{most}"
 
 
 def _flops(count: float) -> str:
@@ -231,15 +192,9 @@ def _flops(count: float) -> str:
     return f"{count / unit:.4g} {name}"
 
 
-def _array(array: LargeArray) -> str:
-    where = "/".join(array.source.replace("\\'", "'").split("/")[-3:])
-    times = f" x {array.count}" if array.count > 1 else ""
-    return f"{size(array.bytes)}  {array.shape}{times}  {where}".rstrip()
-
-
 def plain(report: Report | OutOfMemory) -> dict[str, Any]:
     """Return a report with its derived numbers as JSON values."""
     values = {**asdict(report), "fits": report.fits}
     if isinstance(report, Report):
-        values |= {"peak": report.memory.peak, "roofline_s": report.roofline_s}
+        values["peak"] = report.memory.peak
     return values

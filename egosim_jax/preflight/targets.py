@@ -50,8 +50,6 @@ class Device:
     """Bytes of device memory."""
     bandwidth: float
     """Memory bandwidth in bytes/s."""
-    link: float
-    """Interconnect bandwidth in bytes/s, one way, to the others of its host or slice."""
     chip: Chip | None = None
     """Compiler properties, if it is a GPU."""
 
@@ -61,14 +59,13 @@ UNKNOWN = float("nan")
 HOPPER = Chip(capability=(9, 0), cores=132, shared=233472, l2=52428800, clock_ghz=1.98)
 
 DEVICES: Mapping[str, Device] = {
-    # NVIDIA's data sheets of A100 80GB SXM, H100 SXM, H200 SXM and HGX B200; NVLink one way.
+    # NVIDIA's data sheets of A100 80GB SXM, H100 SXM, H200 SXM and HGX B200.
     "a100": Device(
         kind="NVIDIA A100",
         platform="gpu",
         flops=312e12,
         memory=85.0e9,
         bandwidth=2.039e12,
-        link=300e9,
         chip=Chip(capability=(8, 0), cores=108, shared=167936, l2=41943040, clock_ghz=1.41),
     ),
     "h100": Device(
@@ -77,7 +74,6 @@ DEVICES: Mapping[str, Device] = {
         flops=989.4e12,
         memory=84.9e9,
         bandwidth=3.35e12,
-        link=450e9,
         chip=HOPPER,
     ),
     "h200": Device(
@@ -86,7 +82,6 @@ DEVICES: Mapping[str, Device] = {
         flops=989.4e12,
         memory=150.7e9,
         bandwidth=4.8e12,
-        link=450e9,
         chip=HOPPER,
     ),
     "b200": Device(
@@ -95,18 +90,15 @@ DEVICES: Mapping[str, Device] = {
         flops=2250e12,
         memory=191.5e9,
         bandwidth=8e12,
-        link=900e9,
         chip=Chip(capability=(10, 0), cores=148, shared=233472, l2=132644864, clock_ghz=1.965),
     ),
-    # Google's pages on each TPU version; links one way, all of a chip together; memory as the
-    # compiler reports it.
+    # Google's pages on each TPU version; memory as the compiler reports it.
     "v5e": Device(
         kind="TPU v5 lite",
         platform="tpu",
         flops=197e12,
         memory=15.75 * GIB,
         bandwidth=0.8e12,
-        link=200e9,
     ),
     "v5p": Device(
         kind="TPU v5",
@@ -114,7 +106,6 @@ DEVICES: Mapping[str, Device] = {
         flops=459e12,
         memory=95.74 * GIB,
         bandwidth=2.765e12,
-        link=600e9,
     ),
     "v6e": Device(
         kind="TPU v6 lite",
@@ -122,7 +113,6 @@ DEVICES: Mapping[str, Device] = {
         flops=918e12,
         memory=31.25 * GIB,
         bandwidth=1.6e12,
-        link=400e9,
     ),
 }
 """Devices by the name in a target."""
@@ -211,9 +201,7 @@ def _this_processor() -> Device:
 
     kind = jax.devices("cpu")[0].device_kind
     memory = float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    return Device(
-        kind=kind, platform="cpu", flops=UNKNOWN, memory=memory, bandwidth=UNKNOWN, link=UNKNOWN
-    )
+    return Device(kind=kind, platform="cpu", flops=UNKNOWN, memory=memory, bandwidth=UNKNOWN)
 
 
 def _processors(count: int) -> Sequence[Any]:

@@ -19,10 +19,12 @@ from jaxtyping import Float, Float32, UInt8
 from numpy import ndarray
 
 from egosim_jax.rendering.mesh import MovingMesh
-from egosim_jax.types import Cameras, Kind, SceneState, View
+from egosim_jax.types import Cameras, Kind, Motion, SceneState, View
 
 RendererName = Literal["jax", "numpy"]
 
+PriorKind = Literal["static", "predicted"]
+"""Objects in the view of a clip: at rest, or on their predicted paths."""
 POINT_PX = 2
 """Default side of a drawn point in pixels, as in EgoSim's renderer."""
 
@@ -31,8 +33,18 @@ POINT_PX = 2
 class Renderer(Protocol):
     """Renderer of views and hands, such as the modules `reference` and `jitted`."""
 
-    def render(self, state: SceneState, cameras: Cameras, *, point_px: int) -> View:
-        """Render a state along a camera path. Raises `InputError` if frame 0 shows no point."""
+    def render(
+        self,
+        state: SceneState,
+        cameras: Cameras,
+        *,
+        point_px: int,
+        motion: Motion | None = None,
+    ) -> View:
+        """Render a state along a camera path, with the objects on their predicted paths.
+
+        Raises `InputError` if frame 0 shows no point.
+        """
         ...
 
     def draw_hands(

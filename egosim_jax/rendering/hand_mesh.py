@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from egosim_jax.geometry import smallest_rotation
 from egosim_jax.rendering.mesh import HAND_COLORS, MovingMesh, Side, join_meshes
 from egosim_jax.rendering.skeleton import SKELETONS
 from egosim_jax.types import InputError
@@ -129,21 +130,8 @@ def _rotations(
     for bone in range(len(along)):
         parent = palm if bone % 4 == 0 else rotations[:, bone - 1]
         turned = parent @ along[bone]
-        rotations[:, bone] = _smallest_rotation(turned, directions[:, bone]) @ parent
+        rotations[:, bone] = smallest_rotation(turned, directions[:, bone]) @ parent
     return rotations
-
-
-def _smallest_rotation(
-    start: Float[np.ndarray, "f 3"], end: Float[np.ndarray, "f 3"]
-) -> Float[np.ndarray, "f 3 3"]:
-    """Return the smallest rotation from one unit vector to another (Rodrigues' formula)."""
-    x, y, z = np.cross(start, end).T
-    cross = np.zeros((len(start), 3, 3))
-    cross[:, [2, 0, 1], [1, 2, 0]] = np.stack([x, y, z], axis=-1)
-    cross[:, [1, 2, 0], [2, 0, 1]] = -np.stack([x, y, z], axis=-1)
-    # Opposite vectors have no unique rotation; the bound keeps the result finite.
-    cosine = np.maximum((start * end).sum(axis=-1), -0.999)
-    return np.eye(3) + cross + cross @ cross / (1 + cosine)[:, None, None]
 
 
 @cache

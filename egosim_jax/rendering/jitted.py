@@ -18,7 +18,13 @@ from jaxtyping import Array, Float, Float32, Int, Int32, UInt8
 
 from egosim_jax.geometry import invert, project, transform
 from egosim_jax.rendering.mesh_jitted import draw_mesh as draw_mesh
-from egosim_jax.rendering.reference import GAP_MARGIN_PX, add_margin, check_visible
+from egosim_jax.rendering.reference import (
+    GAP_MARGIN_PX,
+    Paths,
+    add_margin,
+    check_visible,
+    paths_of,
+)
 from egosim_jax.rendering.skeleton import (
     BONE_RADIUS_M,
     FAR_M,
@@ -36,10 +42,12 @@ from egosim_jax.rendering.tiles import (
     put,
     tiles_of,
 )
-from egosim_jax.types import Cameras, Kind, SceneState, View
+from egosim_jax.types import Cameras, Kind, Motion, SceneState, View
 
 
-def render(state: SceneState, cameras: Cameras, *, point_px: int) -> View:
+def render(
+    state: SceneState, cameras: Cameras, *, point_px: int, motion: Motion | None = None
+) -> View:
     """Render a state along a camera path, as `reference.render` does.
 
     Raises `InputError` if the first frame shows no point.
@@ -49,10 +57,11 @@ def render(state: SceneState, cameras: Cameras, *, point_px: int) -> View:
     block = 1 << max(count.bit_length() - 3, 12)
     missing = -count % block
     points = np.pad(state.points_m, ((0, missing), (0, 0)), constant_values=np.nan)
+    paths = [(np.pad(moves, (0, missing)), path) for moves, path in paths_of(state, motion)]
     if point_px == 1:
-        depth_m, index = close_gaps(*splat(points, add_margin(cameras), point_px=1))
+        depth_m, index = close_gaps(*splat(points, add_margin(cameras), point_px=1, paths=paths))
     else:
-        depth_m, index = splat(points, cameras, point_px=point_px)
+        depth_m, index = splat(points, cameras, point_px=point_px, paths=paths)
     check_visible(np.asarray(index[0]), count)
     colors = np.pad(state.colors, ((0, missing), (0, 0)))
     ids = np.pad(state.object_ids, (0, missing))
@@ -71,13 +80,33 @@ def _identify(index: Int[Array, "f h w"], object_ids: Int32[Array, " n"]) -> Int
 
 
 def splat(
-    points_m: Float[Array | np.ndarray, "n 3"], cameras: Cameras, *, point_px: int
+    points_m: Float[Array | np.ndarray, "n 3"],
+    cameras: Cameras,
+    *,
+    point_px: int,
+    paths: Paths = (),
 ) -> tuple[Float32[Array, "f h w"], Int32[Array, "f h w"]]:
-    """Return depth in meters and index of the point seen by each pixel; infinite and -1 if none."""
+    """Return depth in meters and index of the point seen by each pixel; infinite and -1 if none.
+
+    `paths` moves points.
+    """
+    moving = None
+    cameras_from_world = invert(cameras.world_from_camera).astype(np.float64)
+    if paths:
+        # Padded to a power of two, so that the number of moving objects rarely recompiles.
+        slots = 1 << len(paths).bit_length()
+        matrices = np.repeat(cameras_from_world[:, None], slots, axis=1)
+        slot = np.zeros(len(points_m), np.int32)
+        for number, (moves, motion) in enumerate(paths, start=1):
+            slot[moves] = number
+            matrices[:, number] = cameras_from_world @ motion
+        moving = slot
+        cameras_from_world = matrices
     with jax.enable_x64(True):  # as in `reference`: in float32 another of two close points may win
         return _splat(
             points_m,
-            invert(cameras.world_from_camera).astype(np.float64),
+            cameras_from_world,
+            moving,
             cameras.intrinsics_px.astype(np.float32),
             size=(cameras.height, cameras.width),
             point_px=point_px,
@@ -87,7 +116,8 @@ def splat(
 @partial(jax.jit, static_argnames=("size", "point_px"))
 def _splat(
     points_m: Float[Array | np.ndarray, "n 3"],
-    cameras_from_world: Float[Array, "f 4 4"],
+    cameras_from_world: Float[Array, "f *s 4 4"],
+    slot: Int32[Array, " n"] | None,
     intrinsics_px: Float32[Array, "3 3"],
     *,
     size: tuple[int, int],
@@ -101,9 +131,14 @@ def _splat(
 
     def frame(camera_from_world: Array) -> tuple[Array, Array]:
         # Written by components: a product of matrices with three columns takes ten times as long.
+        rows_from_world = (
+            camera_from_world[:3]
+            if slot is None
+            else camera_from_world[slot, :3].transpose(1, 2, 0)
+        )
         x, y, z = (
             (a * points[0] + b * points[1] + c * points[2] + shift).astype(jnp.float32)
-            for a, b, c, shift in camera_from_world[:3]
+            for a, b, c, shift in rows_from_world
         )
         u, v = project(intrinsics_px, jnp.stack([x, y, z], axis=-1))
         column = jnp.ceil(u - point_px / 2) + margin
@@ -111,7 +146,8 @@ def _splat(
         seen = (z >= NEAR_M) & (z <= FAR_M)
         seen &= (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
         nowhere = rows * columns
-        cell = jnp.where(seen, row * columns + column, nowhere).astype(jnp.int32)
+        at = row.astype(jnp.int32) * columns + column.astype(jnp.int32)  # over 2**24 pixels, too
+        cell = jnp.where(seen, at, nowhere)
         nearest = jnp.full(nowhere + 1, jnp.inf, jnp.float32).at[cell].min(z)
         first = jnp.where(z <= nearest[cell], cell, nowhere)
         number = (

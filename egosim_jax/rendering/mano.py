@@ -212,9 +212,12 @@ def skin(
     model: Mano, betas: Float[np.ndarray, " 10"], turns: Float[np.ndarray, "f 16 3"]
 ) -> Float[np.ndarray, "f v 3"]:
     """Return the vertices for a shape and the rotations of the joints, axis times angle."""
+    from scipy.spatial.transform import Rotation
+
     shaped = model.v_template + model.shapedirs @ betas
     joints = model.j_regressor @ shaped
-    rotations = rotations_of(turns)
+    rotations = Rotation.from_rotvec(turns.reshape(-1, 3)).as_matrix()
+    rotations = rotations.reshape(*turns.shape, 3)
     bend = (rotations[:, 1:] - np.eye(3)).reshape(len(turns), -1)
     posed = shaped + np.einsum("vcp,fp->fvc", model.posedirs, bend)
     chained = [rotations[:, 0]]
@@ -228,16 +231,3 @@ def skin(
         moved = (posed - joints[number]) @ chained[number].swapaxes(-1, -2)
         vertices += model.weights[:, number, None] * (moved + places[number][:, None])
     return vertices
-
-
-def rotations_of(turns: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:
-    """Return the rotation matrices of axes times angles in radians (Rodrigues' formula)."""
-    angle = np.linalg.norm(turns, axis=-1)[..., None, None]
-    x, y, z = np.moveaxis(turns, -1, 0)
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)
-    small = angle < 1e-8  # where the quotients are 0 / 0: their limits
-    safe = np.where(small, 1.0, angle)
-    first = np.where(small, 1.0, np.sin(safe) / safe)
-    second = np.where(small, 0.5, (1 - np.cos(safe)) / safe**2)
-    return np.eye(3) + first * cross + second * (cross @ cross)

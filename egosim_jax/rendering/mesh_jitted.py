@@ -74,7 +74,7 @@ def _draw_chunk(
     safe = jnp.where(total == 0, 1, total)
     depth = volume / safe
     met = inside & (total != 0) & (depth >= NEAR_M)
-    share = [part / safe for part in share]
+    share = [value / safe for value in share]
     return put(canvas, tile, jnp.where(met, depth, jnp.inf), _shade(x, y, share, normals, colors))
 
 

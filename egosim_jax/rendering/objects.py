@@ -31,9 +31,9 @@ def draw_objects(view: View, names: Mapping[int, str]) -> UInt8[np.ndarray, "f h
     numbers = np.unique(view.object_ids[view.object_ids > 0]).tolist()
     frames = view.frames.copy()
     for number in numbers:
-        own = view.object_ids == number
-        tinted = (1 - TINT) * view.frames[own] + TINT * np.array(color_of(number))
-        frames[own] = np.rint(tinted).astype(np.uint8)
+        pixels = view.object_ids == number
+        tinted = (1 - TINT) * view.frames[pixels] + TINT * np.array(color_of(number))
+        frames[pixels] = np.rint(tinted).astype(np.uint8)
     return np.stack(
         [
             _write_names(frame, ids, {n: object_name(n, names) for n in numbers})

@@ -6,10 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from PIL import Image
 
-from egosim_jax.geometry import UP_AXES, Up, look_at
+from egosim_jax.geometry import level_axes, look_at
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.rendering.reference import render
 from egosim_jax.runtime.open3d import point_cloud
@@ -29,21 +29,19 @@ MAX_POINT_PX = 16
 """Maximum size of a point in pixels: a sparse cloud would be slow, and hide itself."""
 
 
-def write_portrait(path: Path, state: SceneState, *, up: Up) -> None:
+def write_portrait(path: Path, state: SceneState, *, up: Float[np.ndarray, " 3"]) -> None:
     """Write an image of a state from the left, the front and the right, in a row."""
     with atomic_write(path) as temporary:
         Image.fromarray(np.concatenate(list(portrait(state, up=up)), axis=1)).save(temporary)
 
 
-def portrait(state: SceneState, *, up: Up) -> UInt8[np.ndarray, "3 480 640 3"]:
+def portrait(state: SceneState, *, up: Float[np.ndarray, " 3"]) -> UInt8[np.ndarray, "3 480 640 3"]:
     """Return images of a state from the left, the front and the right, slightly from above.
 
-    The front view looks the way a wearer does: along y if z is up, along z if -y is up. The point
-    size is the distance between neighboring points, up to `MAX_POINT_PX`.
+    The front view looks the way a wearer does: along y if z is up, along z if -y is up
+    (`level_axes`). The point size is the distance between neighboring points, up to `MAX_POINT_PX`.
     """
-    upward = np.array(UP_AXES[up])
-    forward = np.array({"z": (0.0, 1.0, 0.0), "-y": (0.0, 0.0, 1.0)}[up])
-    rightward = np.cross(forward, upward)
+    rightward, forward, upward = level_axes(up).T
     middle = np.median(state.points_m, axis=0).astype(float)
     points = state.points_m.astype(float)
     radius = float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.75)) or 1.0

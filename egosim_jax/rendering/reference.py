@@ -9,11 +9,12 @@ pixel shows the shape that its ray meets first, without shading.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import reduce
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from egosim_jax.geometry import invert, pixel_rays, project, transform
 from egosim_jax.rendering.mesh_reference import draw_mesh as draw_mesh
@@ -25,8 +26,10 @@ from egosim_jax.rendering.skeleton import (
     NEAR_M,
     SKELETONS,
 )
-from egosim_jax.types import Cameras, InputError, Kind, SceneState, View
+from egosim_jax.types import Cameras, InputError, Kind, Motion, SceneState, View
 
+Paths = Sequence[tuple[Bool[np.ndarray, " n"], Float[np.ndarray, "f 4 4"]]]
+"""Points that move, and their motion in the world from the first frame to each frame."""
 _CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T > 0
 NO_POINT = np.iinfo(np.uint64).max
 """Key of a pixel that sees no point."""
@@ -35,11 +38,16 @@ GAP_MARGIN_PX = 2
 
 
 def splat(
-    points_m: Float[np.ndarray, "n 3"], cameras: Cameras, *, point_px: int
+    points_m: Float[np.ndarray, "n 3"],
+    cameras: Cameras,
+    *,
+    point_px: int,
+    paths: Paths | None = None,
 ) -> tuple[Float32[np.ndarray, "f h w"], Int[np.ndarray, "f h w"]]:
     """Return depth in meters and index of the point seen by each pixel; infinite and -1 if none.
 
-    Points that are not finite, nearer than 1 cm or farther than 100 m are not drawn.
+    Points that are not finite, nearer than 1 cm or farther than 100 m are not drawn. `paths` moves
+    points.
     """
     shape = (len(cameras.world_from_camera), cameras.height, cameras.width)
     depth, index = np.full(shape, np.inf, np.float32), np.full(shape, -1)
@@ -47,7 +55,12 @@ def splat(
     points, focal = points_m[known].astype(float), cameras.intrinsics_px.astype(np.float32)
     rows, columns = (size + point_px - 1 for size in shape[1:])
     for frame, world_from_camera in enumerate(cameras.world_from_camera):
-        local = transform(invert(world_from_camera), points).astype(np.float32)
+        camera_from_world = invert(world_from_camera)
+        local = transform(camera_from_world, points)
+        for moves, motion in paths or ():
+            moved = moves[known]
+            local[moved] = transform(camera_from_world @ motion[frame], points[moved])
+        local = local.astype(np.float32)
         drawable = (local[:, 2] >= NEAR_M) & (local[:, 2] <= FAR_M)
         local, number = local[drawable], known[drawable].astype(np.uint64)
         u, v = project(focal, local)
@@ -96,16 +109,21 @@ def unobserved(
     return np.where(wide > 0, 0, 255).astype(np.uint8)
 
 
-def render(state: SceneState, cameras: Cameras, *, point_px: int) -> View:
+def render(
+    state: SceneState, cameras: Cameras, *, point_px: int, motion: Motion | None = None
+) -> View:
     """Render a state along a camera path: Π of EgoSim's section 3.2.
 
-    Gaps between points of one pixel are closed. Raises `InputError` if the first frame shows no
-    point.
+    Objects follow a predicted motion, if one is given; what they uncover is not observed. Gaps
+    between points of one pixel are closed. Raises `InputError` if the first frame shows no point.
     """
+    paths = paths_of(state, motion)
     if point_px == 1:
-        depth_m, index = close_gaps(*splat(state.points_m, add_margin(cameras), point_px=1))
+        depth_m, index = close_gaps(
+            *splat(state.points_m, add_margin(cameras), point_px=1, paths=paths)
+        )
     else:
-        depth_m, index = splat(state.points_m, cameras, point_px=point_px)
+        depth_m, index = splat(state.points_m, cameras, point_px=point_px, paths=paths)
     check_visible(index[0], len(state.points_m))
     return View(
         frames=paint(index, state.colors, gamma=False),
@@ -113,6 +131,12 @@ def render(state: SceneState, cameras: Cameras, *, point_px: int) -> View:
         depth_m=depth_m,
         object_ids=np.append(state.object_ids, np.int32(0))[index],
     )
+
+
+def paths_of(state: SceneState, motion: Motion | None) -> Paths:
+    """Return the points of each object that moves, and its motion in each frame."""
+    paths = {} if motion is None else motion.paths
+    return [(state.object_ids == number, path.motion) for number, path in paths.items()]
 
 
 def add_margin(cameras: Cameras) -> Cameras:

@@ -10,13 +10,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from egosim_jax.geometry import Up
+import numpy as np
+from jaxtyping import Float
+
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.rendering.skeleton import SKELETONS
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from egosim_jax.types import Action, SceneState
 
 RECORDING = "simulation.rrd"
@@ -30,7 +30,8 @@ JPEG_QUALITY = 85
 class Recording:
     """Rerun recording in progress; its file is complete once it is closed."""
 
-    def __init__(self, path: Path, name: str, *, up: Up):
+    def __init__(self, path: Path, name: str, *, up: Float[np.ndarray, " 3"]):
+        """Begin a recording of a world, whose axis nearest to `up` points up in the viewer."""
         import rerun as rr
         import rerun.blueprint as rrb
 
@@ -46,9 +47,9 @@ class Recording:
         column = rrb.Vertical(*(rrb.Spatial2DView(name=n, origin=o) for n, o in images))
         scene = rrb.Spatial3DView(name="world", origin="/world")
         self._stream.send_blueprint(rrb.Blueprint(rrb.Horizontal(scene, column)))
-        axes = rr.ViewCoordinates
-        world = axes.RIGHT_HAND_Z_UP if up == "z" else axes.RIGHT_HAND_Y_DOWN
-        self._stream.log("world", world, static=True)
+        axis = int(np.abs(up).argmax())
+        world = f"RIGHT_HAND_{'XYZ'[axis]}_{'UP' if up[axis] > 0 else 'DOWN'}"
+        self._stream.log("world", getattr(rr.ViewCoordinates, world), static=True)
 
     def add(
         self,

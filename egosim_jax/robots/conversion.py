@@ -13,8 +13,9 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from egosim_jax.data.lerobot_writer import ClipRecord, EpisodeRecord, write_lerobot
-from egosim_jax.geometry import UP_AXES, up_of
-from egosim_jax.rendering import POINT_PX, Renderer
+from egosim_jax.dynamics import predict
+from egosim_jax.geometry import level_axes
+from egosim_jax.rendering import POINT_PX, PriorKind, Renderer
 from egosim_jax.robots.arms import Arm
 from egosim_jax.robots.background import Background, first_cloud, remove_hands
 from egosim_jax.robots.drawing import Drawn, Shape, draw
@@ -24,6 +25,7 @@ from egosim_jax.robots.retarget import Grips, continuous, grips_of
 from egosim_jax.robots.sources import Source
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.simulation.start import Start
+from egosim_jax.state.planes import vertical
 from egosim_jax.types import Action, Cameras, InputError, SceneState, Triplet, near_view
 
 Hands = Literal["acting", "all"]
@@ -96,7 +98,7 @@ def convert(
     backgrounds = _backgrounds(source)
     if base is not None and len(chosen) > 1:
         raise InputError("--base places one robot: use it with --hands acting. (--base)")
-    world_from_up = up_frame(episode.state, joints[:, chosen])
+    world_from_up = up_frame(episode.state, joints[:, chosen], poses[0])
     followers = []
     for hand in chosen:
         grips = grips_of(joints[:, hand], fps=episode.fps)
@@ -130,11 +132,14 @@ def _hands(joints: Float[np.ndarray, "f n j 3"], hands: Hands) -> list[int]:
     return [max(present, key=lambda hand: float(np.nansum(steps[:, hand])))]
 
 
-def up_frame(state: SceneState, joints_m: Float[np.ndarray, "f n j 3"]) -> Float[np.ndarray, "4 4"]:
+def up_frame(
+    state: SceneState,
+    joints_m: Float[np.ndarray, "f n j 3"],
+    world_from_camera: Float[np.ndarray, "4 4"],
+) -> Float[np.ndarray, "4 4"]:
     """Return a frame on the table below the hands, z upwards."""
-    up = np.array(UP_AXES[up_of(state)])
-    ahead = np.array([0.0, 1.0, 0.0] if up[2] else [0.0, 0.0, 1.0])
-    turn = np.stack([np.cross(ahead, up), ahead, up], axis=1)
+    up = vertical(state, world_from_camera)
+    turn = level_axes(up)
     tips = joints_m[np.isfinite(joints_m).all(axis=(2, 3))][:, 1:].reshape(-1, 3) @ turn
     points = state.points_m[state.object_ids == 0] @ turn
     low, high = tips.min(axis=0) - AROUND_M, tips.max(axis=0) + AROUND_M
@@ -273,16 +278,23 @@ def export(conversion: Conversion, folder: Path) -> None:
 
 
 def triplets_of(
-    conversion: Conversion, name: str, renderer: Renderer, *, point_px: int = POINT_PX
+    conversion: Conversion,
+    name: str,
+    renderer: Renderer,
+    *,
+    point_px: int = POINT_PX,
+    prior: PriorKind = "static",
 ) -> Iterator[Triplet]:
     """Yield the triplet of each clip: the scene before it, the grippers' skeletons, the robots.
 
-    `name` begins the ids of the clips. `point_px` is the size of the points of the model's priors.
+    `name` begins the ids of the clips. `point_px` and `prior` are the model's.
     """
     source = conversion.source
     for clip, (state, given) in enumerate(zip(source.states, source.episode.actions, strict=True)):
         action = _skeletons(conversion, clip, given)
-        view = renderer.render(state, action.cameras, point_px=point_px)
+        fps = source.episode.fps
+        motion = predict(state, given, fps=fps) if prior == "predicted" else None
+        view = renderer.render(state, action.cameras, point_px=point_px, motion=motion)
         hands, _ = renderer.draw_hands(action.joints_m, action.cameras, kind="robot")
         yield Triplet(
             video_id=f"{name}_{clip + 1}",

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from egosim_jax.geometry import invert, pixel_rays, project, transform, upsample_intrinsics
 from egosim_jax.robots.models import TABLE, RobotModel
 from egosim_jax.types import Cameras
-from egosim_jax.worlds.tabletop.embree import rays_among
+from egosim_jax.worlds.tabletop.embree import Rays
 from egosim_jax.worlds.tabletop.primitives import Mesh, cuboid, cylinder, sphere
 from egosim_jax.worlds.tabletop.raycast import AMBIENT, SUN, SUNLIGHT
 
@@ -138,7 +138,7 @@ def _draw(
     sun: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return color, depth and mask of one frame."""
-    pose, rays = cameras.world_from_camera[frame], rays_among(meshes)
+    pose, rays = cameras.world_from_camera[frame], Rays(meshes)
     image = _shade(image, scene_m, cameras, frame, rays, sun)
     depth, mask = scene_m.copy(), np.zeros(scene_m.shape, bool)
     rows, columns = _window(meshes, cameras, pose)

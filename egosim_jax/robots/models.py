@@ -8,11 +8,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from egosim_jax.io.bounded import quote_path, refusing
+from egosim_jax.io.untrusted.isolated import read_file
+from egosim_jax.io.untrusted.mjcf import check_files
 from egosim_jax.robots.arms import Arm, Gripper
 from egosim_jax.types import InputError
 
@@ -24,6 +28,12 @@ MOUNTED = "mounted/"
 """Prefix of the names of a gripper that is attached to the arm."""
 OPENINGS = 33
 """Number of positions of the gripper in its table."""
+MIN_TRAVEL = 0.8
+"""Minimum travel of a finger, as a share of the other finger's."""
+MAX_MEMORY, MAX_CPU_S = 1 << 30, 60.0
+"""Maximum memory in bytes and processor time in seconds to compile a model."""
+RESTORE = "restore the model from the MuJoCo Menagerie. (MENAGERIE_ROOT)"
+"""Fix of a model that is not the Menagerie's."""
 
 
 @no_type_check
@@ -80,23 +90,23 @@ def check_installed() -> None:
 
 
 def load_model(arm: Arm) -> RobotModel:
-    """Return the model of an arm from the Menagerie, which is downloaded on first use."""
+    """Return the model of an arm from the Menagerie, which is downloaded on first use.
+
+    Raises `InputError` if its files lead out of their folder, or lack a part that the arm needs.
+    """
     check_installed()
-    spec = _spec(arm.model)
-    if arm.gripper.model is not None:
-        gripper = _spec(arm.gripper.model)
-        gripper.option.impratio, gripper.option.cone = spec.option.impratio, spec.option.cone
-        site = next(site for site in spec.sites if site.name == arm.mount)
-        spec.attach(gripper, prefix=MOUNTED, site=site)
-    return make_model(arm, spec)
+    models = [arm.model, *([arm.gripper.model] if arm.gripper.model else [])]
+    files = [_file_of(*model) for model in models]
+    return read_file(_load, files[0], files, arm, max_memory=MAX_MEMORY, max_cpu_s=MAX_CPU_S)
 
 
-def _spec(model: tuple[str, str]) -> Any:
+def _file_of(folder: str, name: str) -> Path:
     import mujoco_menagerie
 
-    folder, name = model
     try:
-        return mujoco_menagerie.get(folder).spec(name)
+        model = mujoco_menagerie.get(folder)
+        check_files(model.path())
+        return model.xml(name)
     except mujoco_menagerie.MenagerieError as error:
         raise InputError(
             f"The model {folder} of the MuJoCo Menagerie cannot be had: {error} Connect to the "
@@ -104,8 +114,33 @@ def _spec(model: tuple[str, str]) -> Any:
         ) from error
 
 
+def _load(path: Path, files: list[Path], arm: Arm) -> RobotModel:
+    """Return the model of an arm from its files; this runs in a child process."""
+    mujoco: Any = import_module("mujoco")
+
+    with refusing(f"{quote_path(path)} is no model of {arm.title}"):
+        spec, *grippers = [mujoco.MjSpec.from_file(str(file)) for file in files]
+        for gripper in grippers:
+            gripper.option.impratio, gripper.option.cone = spec.option.impratio, spec.option.cone
+            site = _part(spec, "site", arm.mount)
+            spec.attach(gripper, prefix=MOUNTED, site=site)
+        return make_model(arm, spec)
+
+
+def _part(spec: Any, kind: str, name: str) -> Any:
+    """Return a body, joint or site of a specification. Raises `InputError` if it is missing."""
+    if (found := getattr(spec, kind)(name)) is None:
+        raise InputError(
+            f"The robot's model has no {kind} {name!r}, which the arm needs: {RESTORE}"
+        )
+    return found
+
+
 def make_model(arm: Arm, spec: Any) -> RobotModel:
-    """Return the model of an arm from its specification, with a plane for the table."""
+    """Return the model of an arm from its specification, with a plane for the table.
+
+    Raises `InputError` if a body, a joint or the equality of a finger is missing.
+    """
     mujoco: Any = import_module("mujoco")
 
     prefix = MOUNTED if arm.gripper.model else ""
@@ -113,7 +148,11 @@ def make_model(arm: Arm, spec: Any) -> RobotModel:
         spec.delete(key)  # their sizes do not fit a mounted gripper
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     spec.worldbody.add_geom(name=TABLE, type=plane, size=[2, 2, 0.1], group=5)
-    spec.body(prefix + arm.gripper.body).add_site(name=GRIP, group=5)
+    for name in (*arm.joints, prefix + arm.gripper.driver):
+        _part(spec, "joint", name)
+    for name, _ in arm.gripper.tips:
+        _part(spec, "body", prefix + name)
+    _part(spec, "body", prefix + arm.gripper.body).add_site(name=GRIP, group=5)
     mj = spec.compile()
     mj.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     joints = [mj.joint(name) for name in arm.joints]
@@ -147,19 +186,45 @@ def _sweep(
     at = np.array([j.qposadr[0] for j in joints])
     others = [j for j in joints if j.id != driver.id]
     free, follow = (np.array([getattr(j, n)[0] for j in others]) for n in ("dofadr", "qposadr"))
-    gaps, positions, grips = [], [], []
+    gaps, positions, grips, places = [], [], [], []
     for value in np.linspace(gripper.open, gripper.closed, OPENINGS):
         data.qpos[driver.qposadr[0]] = value
         _close_loops(mj, data, free, follow)
         body = _pose(data.body(prefix + gripper.body))
         tips = [_point(data.body(prefix + name), point) for name, point in gripper.tips]
         first, second = ((tip - body[:3, 3]) @ body[:3, :3] for tip in tips)
+        places.append([first, second])
         grips.append(_grip(first, second, np.array(gripper.approach, float)))
         gaps.append((second - first) @ grips[0][:3, 0])
         positions.append(data.qpos[at])
+    _check_fingers(mj, gripper, prefix, np.array(places))
     gaps = np.array(gaps) - gaps[-1]
     order = np.argsort(gaps)
     return gaps[order], np.array(positions)[order], np.array(grips)[order]
+
+
+def _check_fingers(
+    mj: Any, gripper: Gripper, prefix: str, places: Float[np.ndarray, "n 2 3"]
+) -> None:
+    """Raise `InputError` if two fingers with joints do not move alike.
+
+    MuJoCo leaves a joint without equality where it is, and the gripper would open by half.
+    """
+    travels_m = np.linalg.norm(places[0] - places[-1], axis=-1)
+    chains = []
+    for name, _ in gripper.tips:
+        body, joints = mj.body(prefix + name), []
+        while body.id and body.name != prefix + gripper.body:
+            joints += [mj.joint(body.jntadr[0] + n).name for n in range(body.jntnum[0])]
+            body = mj.body(body.parentid[0])
+        chains.append(joints)
+    if all(chains) and travels_m.min() < MIN_TRAVEL * travels_m.max():
+        names = [name for joints in chains for name in joints if name != prefix + gripper.driver]
+        raise InputError(
+            "The fingers of the robot's model move {:.1f} and {:.1f} mm ".format(*1000 * travels_m)
+            + f"with the joint {gripper.driver!r}: an equality of {names[0]!r} is missing or "
+            f"wrong; {RESTORE}"
+        )
 
 
 def _close_loops(mj: Any, data: Any, free: np.ndarray, follow: np.ndarray) -> None:

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import errno
-import io
 import logging
 import os
 import re
 import select
 import sys
 import traceback
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext, redirect_stderr
-from dataclasses import MISSING, fields, is_dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import MISSING, fields, is_dataclass, make_dataclass, replace
 from enum import IntEnum
+from functools import reduce
 from importlib import metadata
+from operator import or_
 from pathlib import Path
 from typing import (
     TYPE_CHECKING,
@@ -27,7 +28,7 @@ from typing import (
     runtime_checkable,
 )
 
-from egosim_jax.runtime import interrupts
+from egosim_jax.runtime import interrupts, preemption
 from egosim_jax.runtime.options import meant, show_options
 from egosim_jax.runtime.phases import show_phases
 from egosim_jax.runtime.terminal import printable
@@ -48,7 +49,7 @@ class ExitCode(IntEnum):
     """Some items failed; the others are done."""
     HUNG = 70
     """Training made no progress within its timeout."""
-    RESUBMIT = 75
+    RESUBMIT = preemption.CODE
     """Training was interrupted and saved: run the same command again."""
     INTERRUPTED = interrupts.CODE
     """Ctrl-C; the message says how to continue if there are results."""
@@ -86,6 +87,27 @@ class Command(Protocol):
         ...
 
 
+def subcommands(kinds: Mapping[str, type]) -> Any:
+    """Return the union of commands by name, for `main` and `group`."""
+    import tyro
+
+    named = [Annotated[kind, tyro.conf.subcommand(name)] for name, kind in kinds.items()]
+    return reduce(or_, named)
+
+
+def group(
+    name: str,
+    about: str,
+    kinds: Mapping[str, type],
+    *,
+    run: Callable[[Any], int] = lambda chosen: chosen.command.run(),
+) -> type:
+    """Return a command of subcommands; `run` gets the command with the chosen one."""
+    fields = [("command", subcommands(kinds))]
+    made = {"run": run, "__doc__": about}
+    return make_dataclass(name, fields, frozen=True, kw_only=True, namespace=made)
+
+
 def main(
     commands: Any,
     *,
@@ -110,10 +132,8 @@ def main(
         if given == ["--version"]:
             print(f"{program} {metadata.version('egosim-jax')}")
             return ExitCode.DONE
-        if (mistake := _mistyped(commands, given, program, others)) is not None:
-            raise InputError(mistake)
         about = f"{description} --version prints the version."
-        command = _parse(commands, given, program, about)
+        command = parse(commands, given, program=program, about=about, others=others)
         _refuse_empty(command)
         _refuse_file(command)
         with context(), show_phases(), show_options(command):
@@ -155,52 +175,63 @@ def _refuse_file(command: Any) -> None:
                     raise InputError(f"{path} is a file: {problem}. Choose another path. (--out)")
 
 
-def _parse(commands: Any, args: Sequence[str], program: str, about: str) -> Command:
-    """Return the command of a command line.
+def parse(
+    commands: Any,
+    args: Sequence[str],
+    *,
+    program: str,
+    about: str = "",
+    others: Sequence[str] = (),
+) -> Command:
+    """Return the command of a command line (`main`).
 
-    An error is printed by a parser of the chosen subcommand alone, because tyro suggests options
-    of all subcommands that it knows.
+    The chosen subcommand is parsed alone, because tyro suggests options of all that it knows.
     """
     import tyro
 
-    def parse(kind: Any, args: Sequence[str], **options: Any) -> Any:
-        return tyro.cli(
-            kind,
-            args=args,
-            config=(tyro.conf.OmitSubcommandPrefixes,),
-            registry=_rules(args),
-            **options,
-        )
+    def read(kind: Any, args: Sequence[str], **options: Any) -> Any:
+        config = (tyro.conf.OmitSubcommandPrefixes,)
+        return tyro.cli(kind, args=args, config=config, registry=_rules(args), **options)
 
-    whole = {"prog": program, "description": about}
-    if {"-h", "--help"} & {*args} or any(arg.startswith("--tyro-") for arg in args):
-        return parse(commands, args, **whole)
-    try:
-        with redirect_stderr(io.StringIO()):  # tyro prints values that it cannot read even so
-            return parse(commands, args, **whole, console_outputs=False)
-    except SystemExit:
-        if (chosen := _chosen(commands, args)) is not None:
-            kind, depth = chosen
-            parse(
-                kind.__origin__,
-                args[depth:],
-                prog=" ".join([program, *args[:depth]]),
-                default=kind.__metadata__[0].default,
+    completing = any(arg.startswith("--tyro-") for arg in args)
+    path = [] if completing else _path(commands, args, program, others)
+    if not path:
+        return read(commands, args, prog=program, description=about)
+    *groups, kind = path
+    chosen = kind.__metadata__[0]
+    command = read(
+        kind.__origin__,
+        args[len(path) :],
+        prog=" ".join([program, *args[: len(path)]]),
+        description=chosen.description,
+        default=chosen.default,
+    )
+    for around in reversed(groups):
+        command = around.__origin__(command=command)
+    return command
+
+
+def _path(commands: Any, args: Sequence[str], program: str, others: Sequence[str]) -> list[Any]:
+    """Return the subcommands that the first arguments name, if the last has no further ones.
+
+    Raises `InputError` with a suggestion for an unknown name.
+    """
+    path: list[Any] = []
+    for name in args:
+        by_name = {kind.__metadata__[0].name: kind for kind in get_args(commands)}
+        if not by_name or name.startswith("-"):
+            break
+        if name not in by_name:
+            names = [*by_name, *(() if path else others)]
+            words = " ".join([program, *args[: len(path)]])
+            raise InputError(
+                f"{words} has no command {name!r}.{meant(name, names)} All: {', '.join(names)}."
             )
-        return parse(commands, args, **whole)
-
-
-def _chosen(commands: Any, args: Sequence[str]) -> tuple[Any, int] | None:
-    """Return the innermost subcommand that the first arguments name, and their number."""
-    for depth, name in enumerate(args, start=1):
-        known = {part.__metadata__[0].name: part for part in get_args(commands)}
-        if name not in known:
-            return None
-        kind = known[name]
-        commands = get_type_hints(kind.__origin__, include_extras=True).get("command")
+        path.append(by_name[name])
+        commands = get_type_hints(path[-1].__origin__, include_extras=True).get("command")
         if commands is None:
-            return kind, depth
-    return None
+            return path
+    return []
 
 
 def _rules(args: Sequence[str]) -> ConstructorRegistry:
@@ -266,20 +297,6 @@ def _rules(args: Sequence[str]) -> ConstructorRegistry:
     return registry
 
 
-def _mistyped(
-    commands: Any, args: Sequence[str], program: str, others: Sequence[str] = ()
-) -> str | None:
-    """Return an error message that suggests a name for an unknown subcommand, or None."""
-    known = {part.__metadata__[0].name: part.__origin__ for part in get_args(commands)}
-    if not known or not args or args[0].startswith("-") or args[0] in others:
-        return None
-    if args[0] in known:
-        below = get_type_hints(known[args[0]], include_extras=True).get("command")
-        return _mistyped(below, args[1:], f"{program} {args[0]}") if below else None
-    names = [*known, *others]
-    return f"{program} has no command {args[0]!r}.{meant(args[0], names)} All: {', '.join(names)}."
-
-
 def run_with_exit_codes(run: Callable[[], int]) -> int:
     """Run a command, printing exceptions as messages and returning their exit codes."""
     interrupts.begin()
@@ -324,24 +341,33 @@ def _reader_ended() -> bool:
     return True
 
 
-def system_failure(error: BaseException) -> str | None:
-    """Return a one-line message for a system error (disk, permissions, memory), or None.
+def system_error(error: BaseException) -> tuple[int, str] | None:
+    """Return the code of a system error (disk, permissions) or of its cause, and where it was.
 
     C++ libraries raise other errors, which have the system's reason in their text.
     """
-    seen: BaseException | None = error
-    while seen is not None:
-        if isinstance(seen, MemoryError):
-            return "not enough memory. Use smaller batches or a machine with more memory."
+    for seen in _causes(error):
         text = str(seen).replace("\n", " ")
         for code in REFUSALS:
             reason = os.strerror(code)
             if (isinstance(seen, OSError) and seen.errno == code) or reason in text:
                 name = getattr(seen, "filename", None)
-                where = f"{name}: {reason}" if name else text[:300]
-                return f"{where}. {REFUSALS[code]}"
-        seen = seen.__cause__ or seen.__context__
+                return code, f"{name}: {reason}" if name else text[:300]
     return None
+
+
+def system_failure(error: BaseException) -> str | None:
+    """Return a one-line message for a system error or for too little memory, or None."""
+    if any(isinstance(seen, MemoryError) for seen in _causes(error)):
+        return "not enough memory. Use smaller batches or a machine with more memory."
+    failure = system_error(error)
+    return None if failure is None else f"{failure[1]}. {REFUSALS[failure[0]]}"
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
 
 
 _WRITABLE = "Choose a folder that can be written to. (--out)"

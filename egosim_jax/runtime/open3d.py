@@ -57,9 +57,9 @@ def nearest(
 
 def _native_spec() -> ModuleSpec | None:
     """Return the native module of a build for CPUs; a build for GPUs chooses one of two itself."""
-    found = find_spec("open3d")
-    folder = Path(*found.submodule_search_locations or ()) if found is not None else Path()
-    if found is None or (folder / "cuda").exists():
+    package = find_spec("open3d")
+    folder = Path(*package.submodule_search_locations or ()) if package is not None else Path()
+    if package is None or (folder / "cuda").exists():
         return None
     return PathFinder.find_spec(PYBIND, [str(folder / "cpu")])
 

@@ -1,19 +1,23 @@
-"""Calls of a function in worker processes that do not inherit the parent's state."""
+"""Worker processes that do not inherit the parent's state, and memory of a process with threads."""
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, TypeVar
 
 T = TypeVar("T")
 THREADS = "OPENBLAS_NUM_THREADS"
 """Environment variable that OpenBLAS reads when it is imported."""
+M_MMAP_THRESHOLD, MMAP_THRESHOLD = -3, 1 << 20
+"""Option of mallopt, and size in bytes from which glibc returns a block as soon as it is freed."""
 
 
 def run_in_processes(
@@ -62,3 +66,14 @@ def _ctrl_c_ignored() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def return_freed_blocks() -> None:
+    """Make this process return large freed blocks to the system; only glibc needs it.
+
+    glibc raises the threshold to the largest freed block, up to 32 MiB. Blocks below it then stay
+    in the arena of their thread, and a server has many threads.
+    """
+    with suppress(AttributeError):  # another C library
+        if sys.platform == "linux":
+            ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, MMAP_THRESHOLD)

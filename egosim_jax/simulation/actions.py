@@ -46,18 +46,32 @@ ORDERS = {
 """Other joint orders of human hands, as indices that convert them to ours."""
 MAX_FINGER_RATIO = 1.4
 """Maximum median ratio of a gripper's finger lengths; above it, the joint order is wrong."""
-REORDERED_RATIO = 0.75
-"""If another order shortens the bones to less than this fraction, it is the joints' order."""
+MAX_BONE_M = 0.07
+"""Maximum length of a finger's bone outside of the palm, in meters."""
+THUMB_RATIO = 1.25
+"""Maximum length of the thumb's bone in the palm, relative to the shortest of the others."""
+EXACT_CHANGE = 0.005
+"""Maximum relative change of the distance of two joints that a bone of an exact hand connects."""
+MAX_CHANGE = 0.05
+"""Maximum relative change of a bone's length in the frames of an exact hand."""
 
 
-def check_action(action: Action, *, state: SceneState, fps: int, continued: bool = False) -> None:
+def check_action(
+    action: Action,
+    *,
+    state: SceneState,
+    fps: int,
+    continued: bool = False,
+    any_hand: bool = False,
+) -> None:
     """Raise `InputError` for a camera that is too fast, a wrong joint order, or an unseen scene.
 
     The first camera must see the scene. If the action is `continued`, so must the last camera: it
-    is the first one of the next action.
+    is the first one of the next action. `any_hand`: the hands need not have a hand's bones, as in
+    random actions of an environment.
     """
     _check_speed(action.cameras, fps)
-    check_order(action)
+    check_order(action, any_hand=any_hand)
     _check_scene(state, action.cameras, 0)
     if continued:
         _check_scene(state, action.cameras, -1)
@@ -74,8 +88,11 @@ def _check_speed(cameras: Cameras, fps: int) -> None:
         )
 
 
-def check_order(action: Action) -> None:
-    """Raise `InputError` if the hands' joints are plausible only in another order."""
+def check_order(action: Action, *, any_hand: bool = False) -> None:
+    """Raise `InputError` if the hands' joints are in another order.
+
+    Human hands are checked by their bones, unless they may be `any_hand`.
+    """
     hands = action.joints_m[np.isfinite(action.joints_m).all(axis=(2, 3))]
     if not len(hands):
         return
@@ -89,17 +106,45 @@ def check_order(action: Action) -> None:
                 "thumb tip, index tip."
             )
         return
-    if _is_hand(hands):  # in a fist, another order may give shorter bones
-        return
-    lengths = {name: _bone_length(hands[:, order]) for name, order in ORDERS.items()}
-    name = min(lengths, key=lambda name: lengths[name])
-    if lengths[name] < REORDERED_RATIO * _bone_length(hands):
-        raise InputError(
-            f"the joints of the hands seem to be in the order {name}: the bones are "
-            f"{lengths[name] / _bone_length(hands):.2f} times as long in it. The order must be "
-            "wrist, then thumb, index, middle, ring and little finger, each from knuckle to tip; "
-            f"reorder them by joints_m[:, :, {ORDERS[name].tolist()}]."
-        )
+    for hand in () if any_hand else np.moveaxis(action.joints_m, 1, 0):
+        joints_m = hand[np.isfinite(hand).all(axis=(1, 2))]
+        if problem := _bone_problem(joints_m):
+            raise InputError(
+                f"the joints of the hands are not in the order of this package: {problem}. The "
+                "order must be wrist, then thumb, index, middle, ring and little finger, each from "
+                f"knuckle to tip.{_reordering(joints_m)}"
+            )
+
+
+def _reordering(hand: Float[np.ndarray, "n 21 3"]) -> str:
+    """Return how to reorder joints that are in an order of `ORDERS`."""
+    for name, order in ORDERS.items():
+        if not _bone_problem(hand[:, order]):
+            return (
+                f" They seem to be in the order {name}: reorder them by joints_m[:, :, "
+                f"{order.tolist()}]."
+            )
+    return ""
+
+
+def _bone_problem(hand: Float[np.ndarray, "n 21 3"]) -> str | None:
+    """Return why the bones are not a hand's; None if they are of constant length, none too long."""
+    if not len(hand):
+        return None
+    bones = _bones(hand)
+    lengths = np.median(bones, axis=0)
+    palm, longest = lengths[:, 0], float(lengths[:, 1:].max())
+    pairs = np.linalg.norm(hand[:, :, None] - hand[:, None], axis=-1)
+    varying = pairs.std(axis=0) / np.maximum(pairs.mean(axis=0), 1e-9) + np.eye(JOINTS["human"])
+    change = float((bones.std(axis=0) / np.maximum(bones.mean(axis=0), 1e-9)).max())
+    # Every joint has a bone, which keeps its length if nothing is noisy.
+    if np.median(varying.min(axis=1)) < EXACT_CHANGE and change > MAX_CHANGE:
+        return f"the length of a bone changes by {change:.0%} of its mean between frames"
+    if longest > MAX_BONE_M:
+        return f"a bone of a finger is {1e3 * longest:.0f} mm long (median)"
+    if palm[0] > THUMB_RATIO * palm[1:].min():
+        return "the first finger is farther from the wrist than another, so it is no thumb"
+    return None
 
 
 def _bones(hands: Float[np.ndarray, "n 21 3"]) -> Float[np.ndarray, "n 5 4"]:
@@ -107,21 +152,6 @@ def _bones(hands: Float[np.ndarray, "n 21 3"]) -> Float[np.ndarray, "n 5 4"]:
     outer = np.arange(1, JOINTS["human"])
     inner = np.where(outer % 4 == 1, 0, outer - 1)
     return np.linalg.norm(hands[:, outer] - hands[:, inner], axis=-1).reshape(-1, 5, 4)
-
-
-def _bone_length(hands: Float[np.ndarray, "n 21 3"]) -> float:
-    return float(_bones(hands).sum())
-
-
-def _is_hand(hands: Float[np.ndarray, "n 21 3"]) -> bool:
-    """Return True if the bones have a hand's proportions: similar palm bones, by far the longest.
-
-    Also, the last bones of a finger must be shorter than the first ones. All are medians over the
-    fingers except the thumb. The pose does not matter: it does not change bone lengths.
-    """
-    palm, first, _, last = np.median(_bones(hands)[:, 1:], axis=0).T
-    alike = palm.min() > 0.75 * palm.mean() and palm.max() < 1.33 * palm.mean()
-    return bool(alike and (palm > 1.4 * first).all() and first.sum() > last.sum())
 
 
 def _check_scene(state: SceneState, cameras: Cameras, frame: int) -> None:
@@ -201,8 +231,8 @@ def places_of(action: Action) -> Float[np.ndarray, "f n j 3"]:
 
 def with_places(action: Action, placed_m: Float[np.ndarray, "f n j 3"]) -> PlacedAction:
     """Return the action with the joints of all hands."""
-    own = {field.name: getattr(action, field.name) for field in fields(Action)}
-    return PlacedAction(**own, placed_m=placed_m)
+    values = {field.name: getattr(action, field.name) for field in fields(Action)}
+    return PlacedAction(**values, placed_m=placed_m)
 
 
 def slice_action(action: Action, start: int, end: int | None) -> Action:
@@ -211,10 +241,10 @@ def slice_action(action: Action, start: int, end: int | None) -> Action:
     cameras, joints = replace(action.cameras, world_from_camera=poses), action.joints_m[start:end]
     lost = np.logical_not(near_view(cameras, joints).any(axis=0))
     joints = np.where(lost[None, :, None, None], np.nan, joints)
-    part = Action(cameras=cameras, joints_m=joints, kind=action.kind, prompt=action.prompt)
+    piece = Action(cameras=cameras, joints_m=joints, kind=action.kind, prompt=action.prompt)
     if isinstance(action, PlacedAction):
-        return with_places(part, action.placed_m[start:end])
-    return part
+        return with_places(piece, action.placed_m[start:end])
+    return piece
 
 
 def split_action(action: Action, lengths: Sequence[int]) -> list[Action]:

@@ -50,7 +50,15 @@ from egosim_jax.io.untrusted.zipped import Archive, from_file
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.simulation.actions import check_action, load_action, save_action
 from egosim_jax.state import snapshot
-from egosim_jax.types import Action, GroundTruth, InputError, SceneState, check_counts
+from egosim_jax.types import (
+    Action,
+    GroundTruth,
+    InputError,
+    SceneState,
+    Shown,
+    VideoSpec,
+    check_counts,
+)
 
 FORMAT, VERSION = "egosim_jax.episode", 1
 DESCRIPTION, FIRST_FRAME = "episode.json", "first_frame.png"
@@ -70,8 +78,8 @@ _NAMES = re.compile(r"episode\.json|first_frame\.png|state/(?:points\.npz|state\
 
 
 @no_type_check
-@dataclass(frozen=True, kw_only=True)
-class Episode:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Episode(Shown):
     """A scene, the actions in it, and optional ground truth: the input of a simulation."""
 
     state: SceneState
@@ -123,10 +131,16 @@ class Episode:
         cameras = self.actions[0].cameras
         return len(cameras.world_from_camera), cameras.height, cameras.width
 
+    @property
+    def video(self) -> VideoSpec:
+        """Length, size and rate of the clips."""
+        frames, height, width = self.shape
+        return VideoSpec(frames=frames, height=height, width=width, fps=self.fps)
+
     def observations(self) -> dict[int, Observation] | None:
         """Return the ground truth for perception by step; None if any of it is missing."""
         steps = range(self.state.step, self.state.step + len(self.actions))
-        found = {
+        observed = {
             step: Observation(
                 cameras=action.cameras,
                 depth_m=known.depth_m,
@@ -137,9 +151,9 @@ class Episode:
             for step, action, known in zip(steps, self.actions, self.ground_truth, strict=False)
         }
         needed = (
-            getattr(o, n) for o in found.values() for n in ("depth_m", "object_ids", "motions")
+            getattr(o, n) for o in observed.values() for n in ("depth_m", "object_ids", "motions")
         )
-        return found if found and all(value is not None for value in needed) else None
+        return observed if observed and all(value is not None for value in needed) else None
 
     def save(self, path: Path | str) -> None:
         """Write a folder, or the byte format if the path ends in .zip.
@@ -228,17 +242,17 @@ def _write(folder: Path, episode: Episode) -> None:
     snapshot.save(folder / "state", episode.state)
     for number, action in enumerate(episode.actions, start=1):
         save_action(folder / f"clip_{number}" / "action.npz", action)
-    for number, known in enumerate(episode.ground_truth, start=1):
+    for number, truth in enumerate(episode.ground_truth, start=1):
         arrays: dict[str, Any] = {
             name: np.ascontiguousarray(value)
             for name in ("frames", "depth_m", "object_ids")
-            if (value := getattr(known, name)) is not None
+            if (value := getattr(truth, name)) is not None
         }
-        if known.motions is not None:
-            numbers = sorted(known.motions)
+        if truth.motions is not None:
+            numbers = sorted(truth.motions)
             arrays["motion_ids"] = np.array(numbers, np.int32)
-            paths = [np.asarray(known.motions[n], float) for n in numbers]
-            arrays["motions"] = np.array(paths).reshape(len(paths), len(known.frames), 4, 4)
+            paths = [np.asarray(truth.motions[n], float) for n in numbers]
+            arrays["motions"] = np.array(paths).reshape(len(paths), len(truth.frames), 4, 4)
         np.savez(folder / f"clip_{number}" / "ground_truth.npz", **arrays)
     if episode.first_frame is not None:
         Image.fromarray(episode.first_frame).save(folder / FIRST_FRAME)
@@ -253,8 +267,8 @@ def _write(folder: Path, episode: Episode) -> None:
         "width": int(width),
         "prompts": [action.prompt for action in episode.actions],
         "target_ids": [
-            None if known.target_id is None else int(known.target_id)
-            for known in episode.ground_truth
+            None if truth.target_id is None else int(truth.target_id)
+            for truth in episode.ground_truth
         ],
         "sha256": {str(file.relative_to(folder)): sha256(file) for file in files},
     }

@@ -8,9 +8,10 @@ folder/clip_N/state/            state after the step
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sized
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Callable, Iterable, Iterator, Sized
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -20,21 +21,19 @@ from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.journal import Journal
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.perception import archive
-from egosim_jax.rendering import POINT_PX, Renderer, reference
+from egosim_jax.rendering import POINT_PX, PriorKind, Renderer, reference
 from egosim_jax.runtime.phases import phase
 from egosim_jax.runtime.terminal import counted
-from egosim_jax.simulation.simulator import (
+from egosim_jax.simulation.simulator import Made, Phase, Simulator, Step
+from egosim_jax.simulation.streams import (
     ClipStream,
-    FrameTimer,
+    KeptStream,
     Latency,
-    Simulator,
-    Step,
     VideoGenerator,
     chunk_frames,
 )
 from egosim_jax.state import snapshot
-from egosim_jax.state.fuse import fuse
-from egosim_jax.types import Action, Clip, Perceived, SceneState, View, check_seed
+from egosim_jax.types import Action, Clip, SceneState, View, check_seed
 
 OUTPUTS = ("clip_*/*",)
 """Globs of files that only a journaled simulation writes."""
@@ -91,7 +90,9 @@ class Rollout:
             "renderer": fingerprint(simulator.renderer),
             "perception": fingerprint(simulator.perception),
             "update_every": simulator.update_every,
-            "fusion": fingerprint((simulator.fusion, simulator.point_px, simulator.fps)),
+            "fusion": fingerprint(
+                (simulator.fusion, simulator.point_px, simulator.prior, simulator.fps)
+            ),
             "seed": str(seed),
         }
 
@@ -105,64 +106,40 @@ class Rollout:
         first_frame: UInt8[np.ndarray, "h w 3"] | None,
     ) -> Step:
         """Run `Simulator.step` with each phase journaled."""
-        simulator, folder = self.simulator, self.folder / f"clip_{number}"
-        timer, by_chunk = FrameTimer(simulator.show), simulator.update_every == "chunk"
-        timed, made = replace(simulator, show=timer), list[Step]()
-        name = self._name.format(number=number)
-        with phase(f"{name}: renders the view", only_if_long=True):
-            view = simulator.render(state, action)  # not journaled: it follows from its inputs
+        folder, clip = self.folder / f"clip_{number}", self._name.format(number=number)
 
-        def make() -> Clip:
-            with phase(f"{name}: generates"):
-                if not by_chunk:
-                    return timed.generate(view, action, seed=seed, first_frame=first_frame)
-                made.append(timed.step(state, action, seed=seed, first_frame=first_frame))
-                return made[0].clip
+        def load_made(path: Path) -> Made:
+            recorded = journal.done[f"{number} generate"]
+            times = {field.name: recorded[field.name] for field in fields(Latency)}
+            return Made(clip=load_clip(path, self.simulator.fps), latency=Latency(**times))
 
-        clip = journal.phase(
-            f"{number} generate",
-            folder / "frames.npz",
-            make=make,
-            save=_save_frames,
-            load=lambda path: load_clip(path, simulator.fps),
-            about=lambda: asdict(timer.latency),
-        )
-        recorded = journal.done[f"{number} generate"]
-        latency = Latency(**{field.name: recorded[field.name] for field in fields(Latency)})
-        if (perception := simulator.perception) is None:
-            return Step(view=view, clip=clip, state=state, latency=latency)
-        if by_chunk:
-            known = RecordedClip(generator=simulator.generator, frames=clip.frames)
-            replay = replace(simulator, show=None, generator=known)
-            step = made[0] if made else replay.step(state, action, seed=seed)
-            view, notes, make_state = step.view, step.notes, lambda: step.state
-        else:
+        files: dict[Phase, tuple[Path, Any, Any]] = {
+            "generate": (folder / "frames.npz", _save_frames, load_made),
+            "perceive": (folder / "perceived.npz", archive.save, archive.load),
+            "fuse": (folder / "state", snapshot.save, snapshot.load),
+        }
+        words = {"generate": "generates", "perceive": "perceives", "fuse": "updates the state"}
 
-            def perceive() -> Perceived:
-                with phase(f"{name}: perceives"):
-                    return perception(clip, action, state)
+        def run(name: Phase, make: Callable[[], Any]) -> Any:
+            if name not in files:  # predictions and views follow from their inputs
+                with phase(f"{clip}: {name}s", only_if_long=True):
+                    return make()
+            path, save, load = files[name]
+            results: list[Any] = []
 
-            perceived = journal.phase(
-                f"{number} perceive",
-                folder / "perceived.npz",
-                make=perceive,
-                save=archive.save,
-                load=archive.load,
-            )
-            notes = perceived.notes
+            def made() -> Any:
+                only_if_long = name == "fuse"
+                with phase(f"{clip}: {words[name]}", only_if_long=only_if_long):
+                    results.append(make())
+                return results[0]
 
-            def make_state() -> SceneState:
-                with phase(f"{name}: updates the state", only_if_long=True):
-                    return fuse(state, perceived, fusion=simulator.fusion)
+            def about() -> dict[str, float]:
+                return asdict(results[0].latency) if name == "generate" else {}
 
-        after = journal.phase(
-            f"{number} fuse",
-            folder / "state",
-            make=make_state,
-            save=snapshot.save,
-            load=snapshot.load,
-        )
-        return Step(view=view, clip=clip, state=after, notes=notes, latency=latency)
+            key = f"{number} {name}"
+            return journal.phase(key, path, make=made, save=save, load=load, about=about)
+
+        return self.simulator.step(state, action, seed=seed, first_frame=first_frame, run=run)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,6 +162,11 @@ class RecordedClip:
         return getattr(self.generator, "point_px", POINT_PX)
 
     @property
+    def prior(self) -> PriorKind:
+        """Objects in the view."""
+        return getattr(self.generator, "prior", "static")
+
+    @property
     def chunk_frames(self) -> tuple[int, ...]:
         """Frames of each chunk."""
         return chunk_frames(self.generator) or (len(self.frames),)
@@ -196,7 +178,7 @@ class RecordedClip:
     def begin(self, first_frame: UInt8[np.ndarray, "h w 3"], seed: int) -> ClipStream:
         """Begin the clip."""
         ends = np.cumsum(self.chunk_frames)[:-1]
-        return _RecordedStream(iter(np.split(self.frames, ends)))
+        return KeptStream(iter(np.split(self.frames, ends)))
 
     def __call__(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
@@ -205,22 +187,9 @@ class RecordedClip:
         return self.frames
 
 
-@dataclass(frozen=True)
-class _RecordedStream:
-    """Chunks of a clip that is known (`simulator.ClipStream`)."""
-
-    chunks: Iterator[UInt8[np.ndarray, "f h w 3"]]
-
-    def put(self, view: View, action: Action) -> None:
-        pass
-
-    def take(self) -> Iterator[UInt8[np.ndarray, "g h w 3"]]:
-        yield next(self.chunks)
-
-
-def _save_frames(path: Path, clip: Clip) -> None:
+def _save_frames(path: Path, made: Made) -> None:
     with atomic_write(path) as temporary:
-        np.savez(temporary, frames=clip.frames)
+        np.savez(temporary, frames=made.clip.frames)
 
 
 def load_clip(path: Path, fps: int) -> Clip:

@@ -7,6 +7,7 @@ No module imports jax or reads a video: `perception` does that.
     filter      objects that the hands acted on
     align       reconstruction to world
     depth       initial state from one RGB-D image
+    silhouettes  colors of the background next to objects
     planes      surfaces that objects stand on
     snapshot    storage as a folder; `ply` for other programs
 """

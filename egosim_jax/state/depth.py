@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from egosim_jax.geometry import pixel_rays, transform, upsample_intrinsics
+from egosim_jax.state.silhouettes import unmix_colors
 from egosim_jax.types import InputError, SceneState, check_counts
 
 DEPTH_M = (0.05, 50.0)
@@ -42,21 +43,23 @@ def state_from_depth(
     are at integer coordinates. `object_ids` has the object of each pixel, 0 for the background
     (`find_objects` finds them), and `names` their names; without it nothing has an id. Each pixel
     gives `points_per_pixel` squared points, interpolated: a camera that moves nearer by this factor
-    sees no gaps. Pixels between two surfaces (`between_surfaces`) give none. Raises `InputError` if
+    sees no gaps. Pixels between two surfaces (`between_surfaces`) give none, and mixed colors at
+    silhouettes are replaced (`unmix_colors`). Raises `InputError` if
     shapes or dtypes differ, if no depth is known, or if the depth does not look like meters.
     """
     check_counts({"points_per_pixel": points_per_pixel})
-    known = known_depth(image, depth_m, intrinsics_px, object_ids)
+    valid = known_depth(image, depth_m, intrinsics_px, object_ids)
     ids = np.zeros(depth_m.shape, np.int32) if object_ids is None else object_ids
     matrix = upsample_intrinsics(np.asarray(intrinsics_px, float), points_per_pixel)
     if points_per_pixel > 1:
-        image, depth_m, known, ids = _split(image, depth_m, known, ids, points_per_pixel)
-    rays = pixel_rays(matrix, height=depth_m.shape[0], width=depth_m.shape[1])[known]
-    points = transform(world_from_camera, rays * depth_m[known][:, None])
+        image, depth_m, valid, ids = _split(image, depth_m, valid, ids, points_per_pixel)
+    rays = pixel_rays(matrix, height=depth_m.shape[0], width=depth_m.shape[1])[valid]
+    points = transform(world_from_camera, rays * depth_m[valid][:, None])
+    ids = ids[valid].astype(np.int32)
     return SceneState(
         points_m=points.astype(np.float32),
-        colors=image[known],
-        object_ids=ids[known].astype(np.int32),
+        colors=unmix_colors(points, image[valid], ids, world_from_camera, intrinsics_px),
+        object_ids=ids,
         last_seen=np.zeros(len(points), np.int32),
         intrinsics_px=intrinsics_px,
         names=dict(names or {}),
@@ -96,19 +99,19 @@ def known_depth(
                 f"{name} is {shape[1]}x{shape[0]} and depth_m is {width}x{height} pixels: they "
                 "must have the same size. Resize one of them."
             )
-    known = np.isfinite(depth_m) & (depth_m > 0)
-    if not known.any():
+    valid = np.isfinite(depth_m) & (depth_m > 0)
+    if not valid.any():
         raise InputError(
             "depth_m has no positive finite value: at least one pixel must have depth."
         )
-    median = float(np.median(depth_m[known]))
+    median = float(np.median(depth_m[valid]))
     if not DEPTH_M[0] <= median <= DEPTH_M[1]:
         raise InputError(
             f"The median depth is {median:.4g}: in meters it must be from {DEPTH_M[0]} to "
             f"{DEPTH_M[1]}. Convert depth_m to meters (millimeters / 1000)."
         )
-    smeared = between_surfaces(np.where(known, depth_m, np.nan), float(intrinsics_px[0][0]))
-    return known & ~smeared
+    smeared = between_surfaces(np.where(valid, depth_m, np.nan), float(intrinsics_px[0][0]))
+    return valid & ~smeared
 
 
 def between_surfaces(depth_m: Float[np.ndarray, "h w"], focal_px: float) -> Bool[np.ndarray, "h w"]:
@@ -118,9 +121,9 @@ def between_surfaces(depth_m: Float[np.ndarray, "h w"], focal_px: float) -> Bool
     edge has no pixel on its ramp; where most edges are sharp, nothing is found. Depth is NaN where
     it is unknown.
     """
-    found = np.zeros(depth_m.shape, bool)
+    near_edge = np.zeros(depth_m.shape, bool)
     edges = ramps = 0
-    for depth, target in ((depth_m, found), (depth_m.T, found.T)):
+    for depth, target in ((depth_m, near_edge), (depth_m.T, near_edge.T)):
         inverse = 1 / depth
         step = np.diff(depth, axis=1)
         limit = STEEP / focal_px * np.minimum(depth[:, :-1], depth[:, 1:])
@@ -142,13 +145,13 @@ def between_surfaces(depth_m: Float[np.ndarray, "h w"], focal_px: float) -> Bool
             ramps += int(ramp.sum()) if length else 0
             for column in range(3, 3 + length):
                 target[:, column : column + count] |= ramp
-    return found & (ramps >= MIN_SMEARED * edges)
+    return near_edge & (ramps >= MIN_SMEARED * edges)
 
 
 def _split(
     image: UInt8[np.ndarray, "h w 3"],
     depth_m: Float[np.ndarray, "h w"],
-    known: Bool[np.ndarray, "h w"],
+    valid: Bool[np.ndarray, "h w"],
     ids: Int[np.ndarray, "h w"],
     times: int,
 ) -> tuple[
@@ -166,16 +169,16 @@ def _split(
 
     height, width = depth_m.shape
     size = times * width, times * height
-    inverse = np.where(known, 1 / np.where(known, depth_m, 1), 0).astype(np.float64)
+    inverse = np.where(valid, 1 / np.where(valid, depth_m, 1), 0).astype(np.float64)
     weight, total = (
         cv2.resize(x, size, interpolation=cv2.INTER_LINEAR)
-        for x in (known.astype(np.float64), inverse)
+        for x in (valid.astype(np.float64), inverse)
     )
-    own, known, ids = (
-        np.repeat(np.repeat(x, times, axis=0), times, axis=1) for x in (inverse, known, ids)
+    mask, valid, ids = (
+        np.repeat(np.repeat(x, times, axis=0), times, axis=1) for x in (inverse, valid, ids)
     )
     between = total / np.maximum(weight, 1e-12)
-    smooth = np.abs(between - own) <= EDGE * own
+    smooth = np.abs(between - mask) <= EDGE * mask
     with np.errstate(divide="ignore"):
-        fine = 1 / np.where(smooth, between, own)
-    return cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), fine, known, ids
+        fine = 1 / np.where(smooth, between, mask)
+    return cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), fine, valid, ids

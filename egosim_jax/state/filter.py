@@ -46,7 +46,7 @@ def interacted_frames(
     names: Mapping[int, str],
 ) -> InteractedFrames:
     """Return the frames in which hands acted on each object; objects without any are absent."""
-    found: InteractedFrames = {}
+    frames_of: InteractedFrames = {}
     for number in sorted(set(np.unique(object_ids).tolist()) & set(names)):
         if number > 0 and not is_hand(names[number]):
             frames = np.array(
@@ -57,8 +57,8 @@ def interacted_frames(
                 ]
             )
             if frames.any():
-                found[number] = fill_gaps(frames)
-    return found
+                frames_of[number] = fill_gaps(frames)
+    return frames_of
 
 
 def disappeared_objects(
@@ -80,8 +80,8 @@ def is_interacting(
     """Return whether an object and any hand or arm interact in one frame (stages 2 and 3)."""
     instance = ids == number
     box, distance = _box(instance), _median(depth_m[instance])
-    for part in np.unique(ids[ids < 0]):
-        hand = ids == part
+    for number_of_hand in np.unique(ids[ids < 0]):
+        hand = ids == number_of_hand
         if box_iou(box, _box(hand)) > MIN_BOX_IOU:
             gap = abs(distance - _median(depth_m[hand]))
             if np.isnan(gap) or gap < MAX_DEPTH_GAP_M:  # unknown depth excludes nothing
@@ -96,8 +96,8 @@ def fill_gaps(frames: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
 
 
 def _median(depths: Float32[np.ndarray, " n"]) -> float:
-    known = depths[np.isfinite(depths) & (depths > 0)]
-    return float(np.median(known)) if len(known) else float("nan")
+    finite = depths[np.isfinite(depths) & (depths > 0)]
+    return float(np.median(finite)) if len(finite) else float("nan")
 
 
 def _box(mask: Bool[np.ndarray, "h w"]) -> Box:

@@ -132,11 +132,11 @@ def apply_motion(state: SceneState, perceived: Perceived, disappeared: set[int])
     points = state.points_m.copy()
     for number, path in perceived.world_from_object.items():
         before = state.world_from_object.get(number, np.eye(4))
-        own = state.object_ids == number
+        chosen = state.object_ids == number
         # An object that stays keeps its exact coordinates: rounding would break idempotence.
-        if own.any() and not np.array_equal(before, path[-1]):
-            moved = transform(path[-1] @ invert(before), points[own].astype(np.float64))
-            points[own] = moved.astype(np.float32)
+        if chosen.any() and not np.array_equal(before, path[-1]):
+            moved = transform(path[-1] @ invert(before), points[chosen].astype(np.float64))
+            points[chosen] = moved.astype(np.float32)
     kept = ~np.isin(state.object_ids, list(disappeared))
     return _Points(
         points_m=points,
@@ -176,9 +176,9 @@ def _surface_behind(
     camera_from_world = invert(cameras.world_from_camera[frame])
     local = transform(camera_from_world, points_m)
     for number, path in perceived.world_from_object.items():
-        own = object_ids == number
+        chosen = object_ids == number
         camera_from_end = camera_from_world @ path[frame] @ invert(path[-1])
-        local[own] = transform(camera_from_end, points_m[own])
+        local[chosen] = transform(camera_from_end, points_m[chosen])
     row, column, inside = pixels_of(cameras, local)
     behind = np.full(len(local), np.nan)
     behind[inside] = depth_m[row[inside], column[inside]] - local[inside, 2]
@@ -199,13 +199,13 @@ def transfer_colors(new: _Points, old: _Points) -> UInt8[np.ndarray, "n 3"]:
 
     colors = new.colors.copy()
     for number in np.intersect1d(new.object_ids, old.object_ids):
-        own = np.flatnonzero(new.object_ids == number)
+        chosen = np.flatnonzero(new.object_ids == number)
         candidates = np.flatnonzero(old.object_ids == number)
         index = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(old.points_m[candidates]))
         index.knn_index()
-        nearest, square = (x.numpy() for x in index.knn_search(new.points_m[own], 1))
+        nearest, square = (x.numpy() for x in index.knn_search(new.points_m[chosen], 1))
         near = square[:, 0] <= REPLACE_M**2
-        colors[own[near]] = old.colors[candidates[nearest[near, 0]]]
+        colors[chosen[near]] = old.colors[candidates[nearest[near, 0]]]
     return colors
 
 

@@ -21,7 +21,7 @@ from egosim_jax.runtime.open3d import point_cloud
 from egosim_jax.state.depth import known_depth
 from egosim_jax.state.planes import SupportPlane, area_of, fit_plane, support_planes
 from egosim_jax.state.regions import RegionConfig, find_regions
-from egosim_jax.types import SceneState, check_counts
+from egosim_jax.types import Counted, SceneState
 
 UP = np.array([0.0, -1.0, 0.0])
 """Rough upward direction in camera coordinates."""
@@ -34,7 +34,7 @@ MAX_WALLS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
-class ObjectSearch:
+class ObjectSearch(Counted):
     """Thresholds of the search for objects in an RGB-D image."""
 
     max_width: int = 480
@@ -57,10 +57,6 @@ class ObjectSearch:
     regions: RegionConfig = field(default_factory=RegionConfig)
     """Division of the candidates into objects."""
 
-    def __post_init__(self) -> None:
-        """Check that counts are positive."""
-        check_counts({"max_width": self.max_width, "min_points": self.min_points})
-
 
 @no_type_check  # shapes and dtypes are checked with messages for users
 def find_objects(
@@ -80,33 +76,33 @@ def find_objects(
     surface = known_depth(image, depth_m, intrinsics_px)
     search = search or ObjectSearch()
     every = max(1, -(-max(depth_m.shape) // search.max_width))
-    known = surface[::every, ::every]
-    coarse = np.where(known, depth_m[::every, ::every], 0.0).astype(float)
+    valid = surface[::every, ::every]
+    coarse = np.where(valid, depth_m[::every, ::every], 0.0).astype(float)
     rays = pixel_rays(np.asarray(intrinsics_px, float), height=image.shape[0], width=image.shape[1])
     points = rays[::every, ::every] * coarse[..., None]
     shown = cv2.GaussianBlur(image, (0, 0), 0.5 * every) if every > 1 else image
     lab = cv2.cvtColor(
         np.ascontiguousarray(shown[::every, ::every]).astype(np.float32) / 255, cv2.COLOR_RGB2LAB
     )
-    heights, above = _heights(points, known, search)
+    heights, above = _heights(points, valid, search)
     footprint_m = coarse * every / float(intrinsics_px[0, 0])
     labels = find_regions(points, lab, above, footprint_m, search.regions)
     labels = _keep_objects(labels, points, heights, search.min_points / every**2, search)
-    labels = _grow_down(labels, lab, heights, known, search)
+    labels = _grow_down(labels, lab, heights, valid, search)
     return _refine(labels, depth_m, every)
 
 
 def _heights(
-    points: Float[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h w"], search: ObjectSearch
+    points: Float[np.ndarray, "h w 3"], valid: Bool[np.ndarray, "h w"], search: ObjectSearch
 ) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Return the height of each pixel above the surface below it, and the candidates.
 
     The height is NaN where there is no surface below.
     """
-    heights = np.full(known.shape, np.nan)
-    cloud = points[known]
+    heights = np.full(valid.shape, np.nan)
+    cloud = points[valid]
     if len(cloud) < 3:
-        return heights, np.zeros(known.shape, bool)
+        return heights, np.zeros(valid.shape, bool)
     tolerance = max(search.min_height_m, 0.008 * float(np.median(cloud[:, 2])))
     lowest = np.full(len(cloud), np.nan)
     noise = np.full(len(cloud), search.min_height_m)
@@ -118,11 +114,11 @@ def _heights(
         lowest[nearer], noise[nearer] = height[nearer], limit
     free = np.flatnonzero(lowest > noise)
     free = np.delete(free, _walls(cloud[free], surfaces, tolerance))
-    heights[known] = lowest
+    heights[valid] = lowest
     above = np.zeros(len(cloud), bool)
     above[free] = lowest[free] < search.max_extent_m
-    candidates = np.zeros(known.shape, bool)
-    candidates[known] = above
+    candidates = np.zeros(valid.shape, bool)
+    candidates[valid] = above
     return heights, candidates
 
 
@@ -189,16 +185,16 @@ def _walls(
     cloud: Float[np.ndarray, "n 3"], surfaces: list[SupportPlane], tolerance_m: float
 ) -> list[int]:
     """Return the indices of the points on walls."""
-    rest, found = np.arange(len(cloud)), []
+    rest, planes = np.arange(len(cloud)), []
     for _ in range(MAX_WALLS if surfaces else 0):
         if len(rest) < 100:
             break
         plane, inliers = fit_plane(cloud[rest], tolerance_m)
         upright = abs(plane[:3] @ surfaces[0].plane[:3]) < np.cos(np.radians(WALL_TILT_DEG))
         if upright and area_of(cloud[rest[inliers]], plane) >= WALL_AREA_M2:
-            found += rest[inliers].tolist()
+            planes += rest[inliers].tolist()
         rest = np.delete(rest, inliers)
-    return found
+    return planes
 
 
 def _keep_objects(
@@ -217,17 +213,17 @@ def _keep_objects(
     numbers, counts = np.unique(labels[labels > 0], return_counts=True)
     fits, standing = {}, set()
     for number, count in zip(numbers.tolist(), counts.tolist(), strict=True):
-        own = labels == number
-        low, high = np.quantile(heights[own], [0.03, 0.97])
-        extent = np.ptp(np.quantile(points[own], [0.02, 0.98], axis=0), axis=0).max()
+        mask = labels == number
+        low, high = np.quantile(heights[mask], [0.03, 0.97])
+        extent = np.ptp(np.quantile(points[mask], [0.02, 0.98], axis=0), axis=0).max()
         if count >= min_pixels and high >= search.min_top_m and extent <= search.max_extent_m:
             fits[number] = low
             if low <= max(search.max_foot_m, high / 2):
                 standing.add(number)
     for number in sorted(fits.keys() - standing, key=lambda n: fits[n]):
-        own = labels == number
-        around = cv2.dilate(own.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        touched = set(np.unique(labels[around & ~own]).tolist()) & standing
+        mask = labels == number
+        around = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        touched = set(np.unique(labels[around & ~mask]).tolist()) & standing
         if any(fits[other] < fits[number] for other in touched):
             standing.add(number)
     order = sorted(standing, key=lambda n: -counts[numbers == n][0])
@@ -240,7 +236,7 @@ def _grow_down(
     labels: Int32[np.ndarray, "h w"],
     lab: Float32[np.ndarray, "h w 3"],
     heights: Float[np.ndarray, "h w"],
-    known: Bool[np.ndarray, "h w"],
+    valid: Bool[np.ndarray, "h w"],
     search: ObjectSearch,
 ) -> Int32[np.ndarray, "h w"]:
     """Return labels with the feet of objects, which are nearer to the surface than its noise.
@@ -252,18 +248,18 @@ def _grow_down(
 
     labels = labels.copy()
     size = 2 * round(max(labels.shape) / 40) + 1
-    surface = known & (labels == 0) & (np.abs(heights) <= search.min_height_m)
+    surface = valid & (labels == 0) & (np.abs(heights) <= search.min_height_m)
     weight = cv2.blur(surface.astype(np.float32), (size, size))
     around = cv2.blur(lab * surface[..., None], (size, size)) / np.maximum(weight, 1e-6)[..., None]
     for _ in range(max(1, max(labels.shape) // 160) + 1):
-        own = (labels > 0).astype(np.float32)
-        near = cv2.blur(own, (3, 3))
-        color = cv2.blur(lab * own[..., None], (3, 3)) / np.maximum(near, 1e-6)[..., None]
+        mask = (labels > 0).astype(np.float32)
+        near = cv2.blur(mask, (3, 3))
+        color = cv2.blur(lab * mask[..., None], (3, 3)) / np.maximum(near, 1e-6)[..., None]
         grown = cv2.dilate(labels.astype(np.float32), np.ones((3, 3), np.uint8)).astype(np.int32)
         to_object = np.linalg.norm(lab - color, axis=2)
         to_surface = np.linalg.norm(lab - around, axis=2)
         new = (labels == 0) & (grown > 0) & (near > 0) & (np.abs(heights) < 2 * search.min_top_m)
-        new &= (to_object < to_surface) & known
+        new &= (to_object < to_surface) & valid
         labels[new] = grown[new]
     return labels
 

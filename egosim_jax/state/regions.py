@@ -205,7 +205,7 @@ def _contract(weights: dict[tuple[int, int], float]) -> dict[int, int]:
     for (one, other), weight in weights.items():
         near.setdefault(one, {})[other] = weight
         near.setdefault(other, {})[one] = weight
-    group = {part: part for part in near}
+    group = {number: number for number in near}
     while near:
         weight, one, other = max(
             ((w, a, b) for a, row in near.items() for b, w in row.items() if a < b),
@@ -213,8 +213,8 @@ def _contract(weights: dict[tuple[int, int], float]) -> dict[int, int]:
         )
         if weight <= 0:
             break
-        for part, now in group.items():
-            group[part] = one if now == other else now
+        for number, now in group.items():
+            group[number] = one if now == other else now
         for third, more in near.pop(other).items():
             near[third].pop(other)
             if third != one:
@@ -226,7 +226,7 @@ def _inward(
     border: Int[np.ndarray, "e 2"], parts: Int[np.ndarray, " n"], width: int, reach: int
 ) -> tuple[Int[np.ndarray, " e"], Int[np.ndarray, " e"]]:
     """Return pixels of both sides of a border, `reach` pixels into their parts where they can."""
-    found = []
+    groups = []
     for side, away in ((0, 1), (1, 0)):
         start = border[:, side]
         step = start - border[:, away]
@@ -238,8 +238,8 @@ def _inward(
             ok &= (np.abs(step) != 1) | (moved // width == start // width)
             ok[ok] &= parts[moved[ok]] == parts[start[ok]]
             best = np.where(ok, moved, best)
-        found.append(best)
-    return found[0], found[1]
+        groups.append(best)
+    return groups[0], groups[1]
 
 
 def _normals(
@@ -290,8 +290,8 @@ def _join_pieces(
     sizes = dict(zip(numbers.tolist(), counts.tolist(), strict=True))
     parts, kept = parts.copy(), []
     for number in order:
-        own = np.flatnonzero(parts == number)
-        hue = np.median(hues[own], axis=0)
+        members = np.flatnonzero(parts == number)
+        hue = np.median(hues[members], axis=0)
         mask = (parts == number).reshape(height, width).astype(np.uint8)
         sliver = not cv2.erode(mask, kernel, borderValue=0).any()
         nearby = set(np.unique(parts[cv2.dilate(mask, kernel, iterations=2).ravel() > 0]).tolist())
@@ -303,11 +303,11 @@ def _join_pieces(
                 limit = config.sliver_m
             elif np.linalg.norm(hue - other_hue) > config.color_difference:
                 continue
-            gap = float(tree.query(flat[own])[0].min())
+            gap = float(tree.query(flat[members])[0].min())
             if gap <= limit:
                 best = min(best, (gap, other))
         if best[1] >= 0:
-            parts[own] = best[1]
+            parts[members] = best[1]
         else:
-            kept.append((number, KDTree(flat[own]), hue))
+            kept.append((number, KDTree(flat[members]), hue))
     return parts

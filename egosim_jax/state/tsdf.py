@@ -58,11 +58,11 @@ def valid_depth_mask(depth_m: Float32[np.ndarray, "f h w"]) -> Bool[np.ndarray, 
     import cv2
 
     window = np.ones((DEPTH_WINDOW_PX, DEPTH_WINDOW_PX), np.uint8)
-    known = np.isfinite(depth_m) & (depth_m > 0)
-    nearest = [cv2.erode(frame, window) for frame in np.where(known, depth_m, np.inf)]
-    farthest = [cv2.dilate(frame, window) for frame in np.where(known, depth_m, 0)]
+    valid = np.isfinite(depth_m) & (depth_m > 0)
+    nearest = [cv2.erode(frame, window) for frame in np.where(valid, depth_m, np.inf)]
+    farthest = [cv2.dilate(frame, window) for frame in np.where(valid, depth_m, 0)]
     step = np.stack(farthest) - np.stack(nearest)
-    return known & (step < MAX_DEPTH_STEP * np.where(known, depth_m, 1))
+    return valid & (step < MAX_DEPTH_STEP * np.where(valid, depth_m, 1))
 
 
 def surface(
@@ -78,8 +78,8 @@ def surface(
     """
     o3d = load_open3d()
 
-    known = np.isfinite(depth_m) & (depth_m > 0) & (depth_m <= fusion.max_depth_m)
-    frames = np.flatnonzero(known.any(axis=(1, 2)))
+    valid = np.isfinite(depth_m) & (depth_m > 0) & (depth_m <= fusion.max_depth_m)
+    frames = np.flatnonzero(valid.any(axis=(1, 2)))
     if not len(frames):
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
     rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
@@ -87,7 +87,7 @@ def surface(
     poses = cameras.world_from_camera.copy()
     poses[:, :3, 3] += GRID_OFFSET_VOXELS * fusion.voxel_m
     blocks = {
-        frame: _blocks(depth_m[frame], known[frame], poses[frame], rays, focal_px, fusion)
+        frame: _blocks(depth_m[frame], valid[frame], poses[frame], rays, focal_px, fusion)
         for frame in frames
     }
     float32 = o3d.core.float32
@@ -107,7 +107,7 @@ def surface(
     intrinsics = o3d.core.Tensor(shifted)
     reach = fusion.truncation_m / fusion.voxel_m
     for frame in frames:
-        depth = _image(np.where(known[frame], depth_m[frame], 0).astype(np.float32))
+        depth = _image(np.where(valid[frame], depth_m[frame], 0).astype(np.float32))
         color = _image(colors[frame].astype(np.float32))
         pose = o3d.core.Tensor(np.linalg.inv(poses[frame]))
         near = o3d.core.Tensor(blocks[frame])
@@ -125,7 +125,7 @@ def surface(
 
 def _blocks(
     depth_m: Float32[np.ndarray, "h w"],
-    known: Bool[np.ndarray, "h w"],
+    valid: Bool[np.ndarray, "h w"],
     grid_from_camera: Float[np.ndarray, "4 4"],
     rays: Float[np.ndarray, "h w 3"],
     focal_px: float,
@@ -136,13 +136,13 @@ def _blocks(
     Open3D's function samples every fourth pixel only, and misses small objects.
     """
     edge = BLOCK_VOXELS * fusion.voxel_m
-    pixel_m = float(np.median(depth_m[known])) / focal_px
+    pixel_m = float(np.median(depth_m[valid])) / focal_px
     every = max(1, int(edge / 4 / pixel_m))  # pixels whose rays are a quarter of a block apart
-    sampled = np.zeros_like(known)
+    sampled = np.zeros_like(valid)
     sampled[::every, ::every] = True
-    if not (known & sampled).any():
+    if not (valid & sampled).any():
         sampled[:] = True
-    rays, depth = rays[known & sampled], depth_m[known & sampled]
+    rays, depth = rays[valid & sampled], depth_m[valid & sampled]
     steps = np.linspace(-1, 1, 1 + 2 * int(np.ceil(2 * fusion.truncation_m / edge)))
     depths = depth[:, None] + steps * fusion.truncation_m
     points = transform(grid_from_camera, (rays[:, None] * depths[..., None]).reshape(-1, 3))

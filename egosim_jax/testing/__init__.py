@@ -22,8 +22,8 @@ from egosim_jax import configs
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.data.metadata import MASK_NAME
 from egosim_jax.data.shards import ShardWriter
-from egosim_jax.io.video import write_video
 from egosim_jax.io.weights import hashes
+from egosim_jax.io.writing import write_video
 from egosim_jax.models.wan.dit import WanDiTConfig
 from egosim_jax.train.encode import example_shapes, mask_of
 from egosim_jax.types import Triplet, VideoSpec

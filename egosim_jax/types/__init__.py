@@ -4,8 +4,9 @@ Frozen dataclasses with checks belong here. Operations on them do not, and no mo
 generator in any framework can use these types.
 
     Triplet, Clip, Action, View, SceneState, Perceived, GroundTruth   the data flow (`data.py`)
+    Motion, ObjectPath, Cause                                         predictions (`motion.py`)
     Cameras, is_rigid                                                 camera paths (`cameras.py`)
-    InputError, VideoSpec, VideoGrid, MeshConfig, check_*             sizes (`settings.py`)
+    InputError, Counted, VideoSpec, VideoGrid, MeshConfig, check_*    sizes (`settings.py`)
 
 Shapes are channel-last everywhere:
 
@@ -39,8 +40,10 @@ from egosim_jax.types.data import (
     near_view,
     object_name,
 )
+from egosim_jax.types.motion import Cause, How, Motion, ObjectPath
 from egosim_jax.types.settings import (
     WAN_GRID,
+    Counted,
     InputError,
     MeshConfig,
     VideoGrid,
@@ -49,6 +52,7 @@ from egosim_jax.types.settings import (
     check_seed,
     check_video,
 )
+from egosim_jax.types.shown import Shown
 
 __all__ = [
     "FOCAL_WIDTHS",
@@ -60,13 +64,19 @@ __all__ = [
     "WAN_GRID",
     "Action",
     "Cameras",
+    "Cause",
     "Clip",
+    "Counted",
     "GroundTruth",
+    "How",
     "InputError",
     "Kind",
     "MeshConfig",
+    "Motion",
+    "ObjectPath",
     "Perceived",
     "SceneState",
+    "Shown",
     "Triplet",
     "VideoGrid",
     "VideoSpec",

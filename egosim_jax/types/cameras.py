@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from egosim_jax.types.settings import InputError
+from egosim_jax.types.shown import Shown
 
 FOCAL_WIDTHS = (0.1, 20.0)
 """Minimum and maximum plausible focal length, in image widths."""
@@ -17,8 +18,8 @@ MAX_SKEW = 0.1
 
 
 @no_type_check
-@dataclass(frozen=True, kw_only=True)
-class Cameras:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Cameras(Shown):
     """Camera trajectory: one pose per frame, in OpenCV axes (x right, y down, z forward)."""
 
     world_from_camera: Float[np.ndarray, "f 4 4"]

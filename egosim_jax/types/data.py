@@ -11,14 +11,15 @@ from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
 from egosim_jax.types.cameras import Cameras, is_rigid
 from egosim_jax.types.settings import InputError, check_video
+from egosim_jax.types.shown import Shown
 
 Kind = Literal["human", "robot"]
 """Kind of hands: human with 21 keypoints, or robot grippers with 3."""
 
 
 @no_type_check
-@dataclass(frozen=True, kw_only=True)
-class SceneState:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class SceneState(Shown):
     """State of the world: colored 3D points, each with its object instance and last observation."""
 
     points_m: Float32[np.ndarray, "n 3"]
@@ -107,8 +108,8 @@ def near_view(cameras: Cameras, joints_m: Float[np.ndarray, "f n j 3"]) -> Bool[
 
 
 @no_type_check
-@dataclass(frozen=True, kw_only=True)
-class Action:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Action(Shown):
     """The wearer's camera path, hands and caption for one clip."""
 
     cameras: Cameras
@@ -186,8 +187,8 @@ class Action:
 
 
 @no_type_check
-@dataclass(frozen=True, kw_only=True)
-class View:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class View(Shown):
     """Rendering of a state along a camera trajectory."""
 
     frames: UInt8[np.ndarray, "f h w 3"]
@@ -201,8 +202,8 @@ class View:
 
 
 @no_type_check
-@dataclass(frozen=True, kw_only=True)
-class Triplet:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Triplet(Shown):
     """Conditions of one clip at the model's length and size, and its target video if known."""
 
     video_id: str
@@ -224,8 +225,8 @@ class Triplet:
 
 
 @no_type_check
-@dataclass(frozen=True, kw_only=True)
-class Clip:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Clip(Shown):
     """A generated video."""
 
     frames: UInt8[np.ndarray, "f h w 3"]
@@ -237,8 +238,8 @@ class Clip:
 
 
 @no_type_check
-@dataclass(frozen=True, kw_only=True)
-class Perceived:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Perceived(Shown):
     """Reconstruction of a clip in world coordinates, frame by frame."""
 
     step: int
@@ -264,8 +265,8 @@ class Perceived:
 
 
 @no_type_check
-@dataclass(frozen=True, kw_only=True)
-class GroundTruth:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class GroundTruth(Shown):
     """Ground truth of one clip; None where it is unknown."""
 
     frames: UInt8[np.ndarray, "f h w 3"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -38,7 +38,18 @@ def check_counts(counts: Mapping[str, int | None]) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class VideoSpec:
+class Counted:
+    """Settings whose whole numbers are all at least 1."""
+
+    def __post_init__(self) -> None:
+        """Raise `InputError` at the first whole number below 1."""
+        check_counts(
+            {f.name: getattr(self, f.name) for f in fields(self) if f.type in ("int", int)}
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoSpec(Counted):
     """Length, size and rate of the videos that a model reads and writes."""
 
     frames: int = 61
@@ -49,11 +60,6 @@ class VideoSpec:
     """Columns of a frame in pixels."""
     fps: int = 16
     """Frame rate of the video in frames per second."""
-
-    def __post_init__(self) -> None:
-        """Check that all are positive; what a model can encode is up to its `VideoGrid`."""
-        counts = ("frames", "height", "width", "fps")
-        check_counts({name: getattr(self, name) for name in counts})
 
 
 @dataclass(frozen=True, kw_only=True)

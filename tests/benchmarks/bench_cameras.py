@@ -27,9 +27,9 @@ import numpy as np
 import tyro
 
 from egosim_jax.io.video import read_video
-from egosim_jax.perception.cameras import CameraLadder, ColmapConfig
-from egosim_jax.perception.cameras.gate import GateConfig, refusals
-from egosim_jax.perception.estimates import CameraEstimate, Rung
+from egosim_jax.perception.video.cameras import CameraLadder, ColmapConfig
+from egosim_jax.perception.video.cameras.gate import GateConfig, refusals
+from egosim_jax.perception.video.estimates import CameraEstimate, Rung
 
 
 @dataclass(frozen=True)

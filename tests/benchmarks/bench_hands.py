@@ -27,9 +27,9 @@ import cv2
 import numpy as np
 
 from egosim_jax.io.video import read_video
-from egosim_jax.perception.estimates import RIGHT, HandTracks
-from egosim_jax.perception.hands import LandmarkHands
-from egosim_jax.perception.hands.track import TrackConfig
+from egosim_jax.perception.video.estimates import RIGHT, HandTracks
+from egosim_jax.perception.video.hands import LandmarkHands
+from egosim_jax.perception.video.hands.track import TrackConfig
 from egosim_jax.rendering.skeleton import SKELETONS
 
 SPAN = slice(60, 231)

@@ -142,8 +142,6 @@ def _predicted_stream(config: ModelConfig, options: argparse.Namespace) -> Itera
             "preflight_gib": needs / GIB,
             "fits": report.fits,
             "roofline_s": found[name],
-            "compute_s": report.compute_s if known else math.nan,
-            "link_s": report.link_s if known else math.nan,
         }
     for number, size in enumerate(config.chunks.sizes):
         same = config.chunk_frames.index(config.chunk_frames[number], min(number, 1))

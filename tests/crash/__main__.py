@@ -1,7 +1,8 @@
-"""Kill writers at each change that they make, or (`kills`) commands at random times.
+"""Kill writers at each change that they make, or commands at random times (`kills`, `stops`).
 
 python -m tests.crash [--writer NAME ...] [--most N] [--seed S]
 python -m tests.crash kills [--commands NAME ...] [--kills N] [--seed S]
+python -m tests.crash stops [--commands NAME ...] [--stops N] [--seed S]
 """
 
 import argparse
@@ -37,19 +38,28 @@ def kills(given: argparse.Namespace) -> int:
     return kills.main(names, given.folder, kills=given.kills, seed=given.seed)
 
 
+def stops(given: argparse.Namespace) -> int:
+    """Send trainings SIGTERM at random times; the exit code."""
+    from tests.crash import stops
+
+    names = given.commands or [*stops.COMMANDS]
+    return stops.main(names, given.folder, stops=given.stops, seed=given.seed)
+
+
 def main() -> int:
     """Parse the command line and run."""
     parser = argparse.ArgumentParser(prog="python -m tests.crash", description=__doc__)
-    parser.add_argument("what", nargs="?", choices=["points", "kills"], default="points")
+    parser.add_argument("what", nargs="?", choices=["points", "kills", "stops"], default="points")
     parser.add_argument("--writer", nargs="+", default=[], help="all, if none is named")
     parser.add_argument("--most", type=int, help="points of a writer; all, if not given")
     parser.add_argument("--commands", nargs="+", help="all, if none is named")
     parser.add_argument("--kills", type=int, default=100, help="of all commands together")
+    parser.add_argument("--stops", type=int, default=20, help="of each training")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--folder", type=Path, default=Path(gettempdir()) / "egosim_crash")
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
-    return kills(given) if given.what == "kills" else points(given)
+    return {"points": points, "kills": kills, "stops": stops}[given.what](given)
 
 
 if __name__ == "__main__":

@@ -24,6 +24,8 @@ from tests.flags import QUICK
 IGNORED = {
     ".lock": "the PID of the process that wrote last",
     "simulation.rrd": "Rerun puts a random id and the time of day into a recording",
+    "times.json": "seconds",
+    "index.html": "the page shows them",
     "checkpoints": "Orbax names files by random ids and notes times; what comes of a checkpoint, "
     "the log and the weights, is compared",
 }
@@ -109,7 +111,7 @@ def kill_often(name: str, folder: Path, *, kills: int, seed: int) -> Tally:
             tally.kills += 1
         else:
             tally.reruns += 1
-        for line in _differences(wanted, _finish(arguments, place, restart=False)):
+        for line in differences(wanted, _finish(arguments, place, restart=False)):
             tally.differences += 1
             print(f"{place}: {line}", flush=True)
         tally.trials += 1
@@ -151,7 +153,8 @@ def _content(path: Path) -> bytes:
     return repr([{k: v for k, v in line.items() if k not in TIMED} for line in lines]).encode()
 
 
-def _differences(wanted: dict[str, str], have: dict[str, str]) -> list[str]:
+def differences(wanted: dict[str, str], have: dict[str, str]) -> list[str]:
+    """Return a line for each path whose digests differ."""
     paths = sorted(wanted.keys() | have.keys())
     return [f"{path} differs" for path in paths if wanted.get(path) != have.get(path)]
 

@@ -41,7 +41,8 @@ from egosim_jax.io.checkpoint import Checkpoints
 from egosim_jax.io.journal import Journal
 from egosim_jax.io.mapped import read_safetensors
 from egosim_jax.io.run import open_folder
-from egosim_jax.io.video import read_video, write_video
+from egosim_jax.io.video import read_video
+from egosim_jax.io.writing import write_video
 from egosim_jax.rendering.portrait import write_portrait
 from egosim_jax.state import snapshot
 from egosim_jax.train import encode
@@ -309,7 +310,9 @@ WRITERS = {
         _file("state.ply", lambda path: _sha256(snapshot.read_ply(path).points_m)),
     ),
     "portrait": Writer(
-        lambda place, _, version: write_portrait(place / "a.png", state(version), up="z"),
+        lambda place, _, version: write_portrait(
+            place / "a.png", state(version), up=np.array([0.0, 0, 1])
+        ),
         _file("a.png", _image),
     ),
     "sheet": Writer(_sheet, _file("sheet.png", _image)),

@@ -68,6 +68,20 @@ def number(data: bytes, random: Random) -> bytes:
     return data[:start] + written + data[start + size :]
 
 
+VALUES = ("null", "[]", "{}", "-1", "1e999", "NaN", '"\\ud800"', "[" * 3000, "9" * 5000, "true")
+
+
+def json_value(data: bytes, random: Random) -> bytes:
+    """Replace a JSON value by one of another kind."""
+    text = data.decode("utf-8", "replace")
+    colons = [place for place, letter in enumerate(text) if letter == ":"]
+    if not colons:
+        return data
+    start = random.choice(colons) + 1
+    ends = [place for mark in ",}\n" if (place := text.find(mark, start)) >= 0]
+    return (text[:start] + random.choice(VALUES) + text[min(ends, default=start) :]).encode()
+
+
 BYTES = (flip, truncate, extend, replace, remove, repeat, exchange, number)
 
 

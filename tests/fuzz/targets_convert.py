@@ -15,7 +15,7 @@ import numpy as np
 
 from egosim_jax import configs
 from egosim_jax.convert.lora import read_lora
-from egosim_jax.convert.lora_settings import ADAPTER
+from egosim_jax.convert.lora_table import ADAPTER
 from egosim_jax.convert.source import sources
 from egosim_jax.io import weights
 from egosim_jax.io.digest import sha256

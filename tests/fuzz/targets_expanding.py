@@ -1,11 +1,10 @@
-"""Fuzzing targets: files that expand, and pages that are made of files."""
+"""Fuzzing targets: files that expand."""
 
 from __future__ import annotations
 
 import io
 import json
 import random
-import struct
 import tarfile
 import zipfile
 import zlib
@@ -18,14 +17,11 @@ from PIL import Image
 from egosim_jax.data.readers.hot3d import Hot3D
 from egosim_jax.data.readers.record3d import Record3D
 from egosim_jax.simulation.episode import Episode
-from egosim_jax.train.run_page import write_page
 from egosim_jax.types import Action, Cameras, GroundTruth
-from tests.fuzz.mutations import INTERESTING
+from tests.fuzz.mutations import INTERESTING, json_value
 from tests.fuzz.target import Target, pixels
 from tests.fuzz.targets_convert import zip_number
-from tests.fuzz.targets_media import change_chunk
-from tests.fuzz.targets_run import a_state, json_value
-from tests.training.finished import write_stage
+from tests.fuzz.targets_run import a_state
 from tests.unit.data.readers.test_hot3d import write_clip
 
 FRAMES, SIZE = 5, (32, 48)
@@ -170,48 +166,6 @@ def pax_headers(data: bytes, rng: random.Random) -> bytes:
     return file.getvalue()[:place] + data
 
 
-# Pages
-
-
-def make_run(folder: Path) -> None:
-    """Write the folder of a training."""
-    write_stage(folder / "run", samples=(20,))
-
-
-def read_page(folder: Path) -> Any:
-    """Make its page; only its size is bounded."""
-    assert write_page(folder / "run").stat().st_size < 50_000_000
-    return "a page"
-
-
-NAMES = ("$\\foo$", "$", "_", "\x1b[31m", "</table>", "\u202e", "x" * 5000, "validation_loss_9", "")
-VALUES: tuple[Any, ...] = (
-    *INTERESTING, 10**400, 1e308, -1e308, 5e-324, float("nan"), float("inf"), True, None, "x", [[]],
-    {"a": {}}, [1] * 2000, "",
-)  # fmt: skip
-
-
-def other_value(data: bytes, rng: random.Random) -> bytes:
-    """Add names and values to a line or document, or replace its values."""
-    lines = data.split(b"\n")
-    at = rng.randrange(len(lines))
-    for start in (at, 0):
-        text = b"\n".join(lines) if start == 0 else lines[at]
-        try:
-            document = json.loads(text)
-        except ValueError:
-            continue
-        if isinstance(document, dict) and document:
-            target = rng.choice([document, *(v for v in document.values() if isinstance(v, dict))])
-            for _ in range(rng.choice((1, 1, 200))):
-                names = (*target, *NAMES, f"n{rng.randrange(999)}")
-                target[rng.choice(names)] = rng.choice(VALUES)
-        new = json.dumps(document).encode()
-        return new if start == 0 else b"\n".join([*lines[:at], new, *lines[at + 1 :]])
-    number = struct.pack("<d", rng.choice((0.0, 1.0)))
-    return data + number
-
-
 ARCHIVE = (zip_number, other_entries, overlap)
 TARGETS: list[Target] = [
     Target(
@@ -237,13 +191,5 @@ TARGETS: list[Target] = [
         files=("clip.tar",),
         lossy=LOSSY,
         mutations=(other_header, pax_headers),
-    ),
-    Target(
-        name="page of a run",
-        make=make_run,
-        read=read_page,
-        files=("run/*.json*", "run/samples/*"),
-        lossy=LOSSY,
-        mutations=(json_value, other_value, change_chunk),
     ),
 ]

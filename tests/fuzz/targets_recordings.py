@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from egosim_jax.data.readers.lzfse import unpacked_size
+from egosim_jax.data.readers.record3d import unpacked_size
 from egosim_jax.data.recording import Recording
 from egosim_jax.data.scene_points import ScenePoints
 from egosim_jax.io.untrusted import hdf5, isolated, parquet

@@ -18,6 +18,7 @@ from egosim_jax.io.private import PrivateCache
 from egosim_jax.perception import archive
 from egosim_jax.state import snapshot
 from egosim_jax.types import Cameras, InputError, Perceived, SceneState
+from tests.fuzz.mutations import json_value
 from tests.fuzz.target import Target
 
 FRAMES, SIZE = 2, (16, 24)
@@ -145,20 +146,6 @@ def _numbers() -> Any:
     return iter(grain.MapDataset.range(100).shuffle(seed=1).repeat().to_iter_dataset())
 
 
-def _make_parts(folder: Path) -> None:
-    from egosim_jax.io.parts import cut
-
-    (folder / "x.bin").write_bytes(bytes(range(256)))
-    cut([folder / "x.bin"], folder / "parts", part_bytes=100)
-    (folder / "x.bin").unlink()
-
-
-def _read_parts(folder: Path) -> Any:
-    from egosim_jax.io.parts import join
-
-    return [path.read_bytes() for path in join(folder / "parts", folder / "joined")]
-
-
 def _make_checkpoint(folder: Path) -> None:
     import jax.numpy as jnp
 
@@ -188,20 +175,6 @@ def _abstract() -> Any:
         "weights": jax.ShapeDtypeStruct((64,), jnp.float32, sharding=place),
         "step": jax.ShapeDtypeStruct((), jnp.int32, sharding=place),
     }
-
-
-VALUES = ("null", "[]", "{}", "-1", "1e999", "NaN", '"\\ud800"', "[" * 3000, "9" * 5000, "true")
-
-
-def json_value(data: bytes, random: Random) -> bytes:
-    """Replace a JSON value by one of another kind."""
-    text = data.decode("utf-8", "replace")
-    colons = [place for place, letter in enumerate(text) if letter == ":"]
-    if not colons:
-        return data
-    start = random.choice(colons) + 1
-    ends = [place for mark in ",}\n" if (place := text.find(mark, start)) >= 0]
-    return (text[:start] + random.choice(VALUES) + text[min(ends, default=start) :]).encode()
 
 
 def json_line(data: bytes, random: Random) -> bytes:
@@ -258,14 +231,6 @@ TARGETS = [
         read=_read_program,
         files=("program",),
         sealed=True,
-    ),
-    Target(
-        name="parts",
-        make=_make_parts,
-        read=_read_parts,
-        files=("parts/*",),
-        lossy="files have the names that parts.json gives them",
-        mutations=(json_value, json_line),
     ),
     Target(
         name="checkpoint",

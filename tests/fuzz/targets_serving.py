@@ -13,8 +13,8 @@ import numpy as np
 from egosim_jax.interactive.server import wire
 from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.types import InputError
+from tests.fuzz.mutations import json_value
 from tests.fuzz.target import Target
-from tests.fuzz.targets_run import json_value
 
 SESSION, WATCH = "fuzzed", "watched"
 
@@ -22,8 +22,9 @@ SESSION, WATCH = "fuzzed", "watched"
 @functools.cache
 def _service() -> Any:
     """Service of a painted world with a session that no message names."""
+    from egosim_jax.interactive.options import Limits
     from egosim_jax.interactive.server.service import Service
-    from egosim_jax.interactive.server.store import Limits, Store
+    from egosim_jax.interactive.server.store import Store
     from tests.painted import painted
 
     folder = Path(tempfile.mkdtemp())
@@ -90,7 +91,7 @@ def _send(data: bytes, *, json: bool) -> str:
     finally:
         watched = store.sessions[WATCH]
         assert watched.committed == 1
-        assert not watched.busy.locked()
+        assert not watched.busy
         for name in set(store.sessions) - {SESSION, WATCH}:
             store.remove({"session": name}).result()
     return "done"

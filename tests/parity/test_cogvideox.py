@@ -15,8 +15,8 @@ from egosim_jax.convert.rules import assign
 from egosim_jax.convert.tables import cogvideox_dit, cogvideox_vae, t5, umt5, weight_shapes
 from egosim_jax.io.weights import fill
 from egosim_jax.models.cogvideox.dit import CogVideoXDiTConfig
-from egosim_jax.models.cogvideox.t5 import T5Config
 from egosim_jax.models.cogvideox.vae import CogVideoXVAEConfig
+from egosim_jax.models.t5 import T5Config
 from tests.translation import translate
 
 TOLERANCE = 1e-5

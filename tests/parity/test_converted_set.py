@@ -24,9 +24,9 @@ from egosim_jax.convert.tables import clip_vision, umt5, wan_dit, wan_vae
 from egosim_jax.diffusion.process import RectifiedFlow
 from egosim_jax.generation.encoding import encode_condition, pack
 from egosim_jax.generation.generator import Generator
+from egosim_jax.models.t5 import UMT5Config
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
 from egosim_jax.models.wan.dit import WanDiTConfig
-from egosim_jax.models.wan.umt5 import UMT5Config
 from egosim_jax.models.wan.vae import WanVAEConfig
 from egosim_jax.types import Triplet, VideoSpec
 from tests.translation import translate, translate_back

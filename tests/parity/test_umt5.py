@@ -10,8 +10,7 @@ from transformers import UMT5EncoderModel
 
 from egosim_jax.convert.tables import umt5 as table
 from egosim_jax.io.weights import fill, flat_shapes
-from egosim_jax.models.t5 import relative_buckets
-from egosim_jax.models.wan.umt5 import UMT5, UMT5Config
+from egosim_jax.models.t5 import UMT5Config, relative_buckets
 from tests.translation import translate, translate_back
 
 # Heads x head_dim is not dim, and 40 tokens reach every bucket.
@@ -49,7 +48,7 @@ def theirs():
 
 @pytest.fixture(scope="module")
 def ours(theirs):
-    model = nnx.eval_shape(lambda: UMT5(CONFIG, rngs=nnx.Rngs(0)))
+    model = nnx.eval_shape(lambda: CONFIG.build(rngs=nnx.Rngs(0)))
     state = {name: tensor.numpy() for name, tensor in theirs.state_dict().items()}
     rules, ignored = table.transformers(CONFIG), table.TABLE.ignored(CONFIG)
     fill(model, translate(state, rules, ignore=ignored))
@@ -82,7 +81,7 @@ def test_relative_buckets_are_those_of_transformers(theirs, buckets, max_distanc
 
 def test_official_names_and_shapes_are_those_of_the_released_file():
     config = UMT5Config()
-    model = nnx.eval_shape(lambda: UMT5(config, rngs=nnx.Rngs(0)))
+    model = nnx.eval_shape(lambda: config.build(rngs=nnx.Rngs(0)))
     full_size = {
         path: np.broadcast_to(np.float32(0), shape) for path, shape in flat_shapes(model).items()
     }

@@ -73,7 +73,7 @@ def test_the_other_experiments_give_a_model_of_dwm_its_conditions_or_refuse_it(
     assert main(f"experiment tabletop --scenes 1 --seeds 1 --steps 2 {model}/run".split()) == 0
     tables = json.loads((tmp_path / "run/report.json").read_text())["tables"]
     assert tables.keys() == {"human"}  # a gripper has no mesh
-    twin = HeldOutClip.make(100, TINY.video, "human", prior="static", hands="mesh")
+    twin = HeldOutClip.make(100, TINY, conditions=("static", "mesh"))
     copied = twin.evaluate(twin.triplet.prior)["psnr"]
     assert tables["human"]["prior copied"]["psnr"]["mean"] == pytest.approx(copied)
     for command, reason in (

@@ -1,7 +1,6 @@
 """Episodes by their commands: make from a seed or from files, check, show, simulate."""
 
 import json
-import re
 import shutil
 
 import numpy as np
@@ -70,22 +69,6 @@ def test_an_episode_without_ground_truth_is_simulated_but_not_scored(weights, tm
     assert (tmp_path / "run" / "contact_sheet.png").exists()
 
 
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        (["--perception", "oracle"], "needs ground truth"),
-        (["--config", "tabletop"], "they must be equal"),
-        (["--clips", "3"], "has 2 clips, not 3"),
-        (["--robot"], "an episode has its own hands"),
-    ],
-)
-def test_an_episode_that_does_not_fit_is_refused(weights, tmp_path, capsys, episode, more, message):
-    bare = Episode(state=episode.state, actions=episode.actions, fps=episode.fps)
-    bare.save(tmp_path / "bare")
-    assert simulate(weights, tmp_path / "run", "--episode", str(tmp_path / "bare"), *more) == 2
-    assert message in " ".join(capsys.readouterr().err.split())
-
-
 def test_the_inputs_are_drawn_on_a_sheet(tmp_path, episode):
     episode.save(tmp_path / "episode")
     assert (
@@ -144,36 +127,3 @@ def test_files_of_cameras_and_hands_become_an_episode(tmp_path, episode):
     shutil.rmtree(tmp_path / "out")
     assert make(tmp_path, "--state", str(tmp_path / "state")) == 0
     assert len(Episode.load(tmp_path / "out").state.points_m) == len(episode.state.points_m)
-
-
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        ([], "The scene must be given once"),
-        (["--image", "scene.png"], "The scene must be given once"),
-        (["--state", "state", "--prompts", "one"], "1 prompts for 2 files"),
-        (["--state", "state", "--config", "tabletop"], "comes near the view|they must be equal"),
-    ],
-)
-def test_incomplete_files_are_refused(tmp_path, monkeypatch, capsys, episode, more, message):
-    monkeypatch.chdir(tmp_path)
-    write_files(tmp_path, episode)
-    assert make(tmp_path, *more) == 2
-    assert re.search(message, " ".join(capsys.readouterr().err.split()))
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("[]", "must be an object of world_from_camera"),
-        ('{"joints_m": [[["a"]]]}', "not an array of numbers"),
-        ('{"world_from_camera": 1, "intrinsics_px": 1, "joints_m": 1}', "joints_m has shape"),
-    ],
-)
-def test_a_json_file_that_is_no_action_is_named(tmp_path, capsys, episode, text, message):
-    write_files(tmp_path, episode)
-    (tmp_path / "2.json").write_text(text)
-    assert make(tmp_path, "--state", str(tmp_path / "state")) == 2
-    error = " ".join(capsys.readouterr().err.split())
-    assert "2.json" in error
-    assert message in error

@@ -9,6 +9,7 @@ import pytest
 from egosim_jax import configs
 from egosim_jax.cli.play import Play
 from egosim_jax.geometry import invert, project, transform
+from egosim_jax.interactive.options import ClipOptions
 from egosim_jax.interactive.play.moves import suggest_goal
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.types import InputError, VideoSpec
@@ -31,13 +32,13 @@ def test_a_missing_library_is_named(monkeypatch):
 def test_the_denoising_steps_are_those_that_are_given(monkeypatch):
     monkeypatch.setattr("egosim_jax.cli.play.find_spec", lambda name: True)
 
-    def load(config, weights):
+    def load(config, weights, **_):
         raise InputError(f"{config.steps} steps")
 
     monkeypatch.setattr("egosim_jax.generation.generator.Generator.load", load)
     for steps, loaded in ((2, 2), (None, configs.get("tabletop").steps)):
         with pytest.raises(InputError, match=f"^{loaded} steps"):
-            Play(steps=steps, port=0).run()
+            Play(clips=ClipOptions(steps=steps), port=0).run()
 
 
 def pixels_of_places():

@@ -16,7 +16,8 @@ import pytest
 
 from egosim_jax.cli.__main__ import main as egosim
 from egosim_jax.convert.__main__ import main as egosim_convert
-from egosim_jax.io.video import read_video, write_video
+from egosim_jax.io.video import read_video
+from egosim_jax.io.writing import write_video
 from egosim_jax.state import snapshot
 from egosim_jax.train.__main__ import main as egosim_train
 from tests.crash import writers
@@ -54,7 +55,7 @@ LONG = {"experiment", "debug", "tabletop"}
 """Commands that take minutes; only their end is tested."""
 FREE = {"evaluate": 1, "view": 1, "lora": 1, "look": 1}
 """Free pages of the full disk by command; 8 for the others."""
-PASSING = (".lock", ".tmp", ".part", ".part.log")
+PASSING = (".lock", ".tmp", ".part")
 """Suffixes of files that exist only until the command is complete."""
 PARTS = "/parts/"
 """Folder that exists only until the command is complete."""

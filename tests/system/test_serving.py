@@ -100,9 +100,9 @@ def lines(process, found):
             print(found[-1], flush=True)
 
 
-def drive(kind, port, *, until=None):
+def drive(kind, port, *, names="ab", until=None):
     """Run two clients at once until they end, or until one has made some steps."""
-    clients = [client(kind, port, name, seed) for name, seed in (("a", 3), ("b", 4))]
+    clients = [client(kind, port, name, seed) for name, seed in zip(names, (3, 4), strict=True)]
     found = [[], []]
     threads = [
         threading.Thread(target=lines, args=pair) for pair in zip(clients, found, strict=True)
@@ -133,24 +133,25 @@ def committed(folder):
 
 def kill_and_continue(kind, command, folder):
     """Kill the server in mid step, continue: the steps before and after, what was committed."""
-    server = Server(folder / "killed", command)
+    server = Server(folder, command)
     clients, threads, before = drive(kind, server.port, until=2)
     time.sleep(0.3)
     server.end(signal.SIGKILL)
     for process, thread in zip(clients, threads, strict=True):
         process.wait(60)
         thread.join()
-    known, underway = committed(folder / "killed")
-    print(f"killed with {len(known)} committed steps, {underway} under way", flush=True)
-    server = Server(folder / "killed", command)
+    states, underway = committed(folder)
+    print(f"killed with {len(states)} committed steps, {underway} under way", flush=True)
+    server = Server(folder, command)
     after = drive(kind, server.port)[2]
+    straight = drive(kind, server.port, names="cd")[2]
     assert server.end(signal.SIGTERM) == 0
-    return before, after, (known, underway)
+    return before, after, straight, (states, underway)
 
 
 def check_kept(before, after, killed):
     """Check that all committed steps are as they were, and that all steps are made once."""
-    known, underway = killed
+    kept, underway = killed
     assert underway
     assert all(underway.count(session) == 1 for session in underway)
     for session, some, all_ in zip("ab", before, after, strict=True):
@@ -158,38 +159,31 @@ def check_kept(before, after, killed):
         assert some == all_[: len(some)]
         assert len(some) < STEPS
         states = {number: state for number, state, _ in all_}
-        steps = [number for name, number in known if name == session]
+        steps = [number for name, number in kept if name == session]
         assert steps == list(range(1, len(steps) + 1))
-        assert all(known[session, number] == states[number] for number in steps)
-
-
-def straight(kind, command, folder):
-    """The steps without a kill."""
-    server = Server(folder / "straight", command)
-    found = drive(kind, server.port)[2]
-    assert server.end(signal.SIGTERM) == 0
-    return found
+        assert all(kept[session, number] == states[number] for number in steps)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [OURS, pytest.param(OPENPI, marks=NEEDS_OPENPI)], ids=len)
-def test_clients_continue_after_a_kill_to_the_same_states(tmp_path, kind):
-    command = ["tests.painted", "--pause", "0.5"]
-    before, after, killed = kill_and_continue(kind, command, tmp_path)
+def test_clients_continue_after_a_kill_to_the_same_states(tmp_path, kind, capfd):
+    command = ["tests.painted", "--pause", "0.5", "--batch", "2"]
+    before, after, straight, killed = kill_and_continue(kind, command, tmp_path)
     check_kept(before, after, killed)
-    assert after == straight(kind, command, tmp_path)
+    assert after == straight
+    assert "a batch of 2" in capfd.readouterr().err
 
 
 @pytest.mark.slow
 def test_two_streams_of_a_batch_come_as_they_are_decoded_and_survive_a_kill(tmp_path):
     command = ["tests.painted", "--pause", "0.5", "--batch", "2"]
-    server, known = Server(tmp_path, command), {}
+    server, rested = Server(tmp_path, command), {}
 
     def stream(name, step_id, shown):
         with Client(f"ws://127.0.0.1:{server.port}") as one:
             session = one.create(session=name, seed=3) if step_id == 1 else one.attach(name)
-            known[name] = session.reply.get("row", known.get(name))
-            rows = np.tile(known[name], (4, 1)) + 0.01 * step_id
+            rested[name] = session.reply.get("row", rested.get(name))
+            rows = np.tile(rested[name], (4, 1)) + 0.01 * step_id
             return session.step(rows, show=shown.append)
 
     shown = {name: [] for name in "ab"}
@@ -211,26 +205,18 @@ def test_two_streams_of_a_batch_come_as_they_are_decoded_and_survive_a_kill(tmp_
     with Client(f"ws://127.0.0.1:{server.port}") as one:
         session = one.attach("a")
         session.step_id = 1
-        reply = session.step(np.tile(known["a"], (4, 1)) + 0.02, show=again.append)
+        reply = session.step(np.tile(rested["a"], (4, 1)) + 0.02, show=again.append)
     np.testing.assert_array_equal(reply["frames"][:1], parts[0])
     assert not again  # the step was on disk: the restarted server makes it before it is asked
     assert server.end(signal.SIGTERM) == 0
-
-
-@pytest.mark.slow
-def test_committed_steps_of_batches_survive_a_kill(tmp_path, capfd):
-    command = ["tests.painted", "--pause", "0.5", "--batch", "2"]
-    check_kept(*kill_and_continue(OURS, command, tmp_path))
-    assert "a batch of 2" in capfd.readouterr().err
 
 
 if __name__ == "__main__":
     batch = sys.argv[2:] or ["1"]
     served = ["egosim_jax.cli", "serve", "--port", "0", "--batch", *batch, "--out"]
     kinds = OPENPI if "OPENPI_PYTHON" in os.environ else OURS
-    results = kill_and_continue(kinds, served, Path(sys.argv[1]))
-    check_kept(*results)
+    begun, continued, uninterrupted, at_kill = kill_and_continue(kinds, served, Path(sys.argv[1]))
+    check_kept(begun, continued, at_kill)
     print("every committed step is as it was, the steps under way are made")
-    uninterrupted = straight(kinds, served, Path(sys.argv[1]))
-    equal = results[1] == uninterrupted
+    equal = continued == uninterrupted
     print("equal to the byte" if equal else f"the uninterrupted run differs: {uninterrupted}")

@@ -18,6 +18,7 @@ from egosim_jax.evaluation.metrics.report import score
 from egosim_jax.generation.generator import Generator
 from egosim_jax.io.digest import sha256
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
+from egosim_jax.worlds.tabletop.dataset import conditions_of
 
 EXPECTED, IMAGE = (Path(__file__).with_name(f"shipped.{end}") for end in ("json", "png"))
 NAME, SEED = "tabletop", 0
@@ -37,8 +38,9 @@ def make_clip() -> tuple[np.ndarray, float]:
     """Generate a clip of a held-out scene; return its frames and PSNR in dB."""
     config, folder = configs.get(NAME), configs.weights_of(NAME, None)
     target = next(make_sequence(SEED, spec=config.video))
+    triplet = to_triplet(target, prior=conditions_of(config)[0])
     generator = Generator(config.at(folder), Networks.load(config, folder))
-    (clip,) = generator.generate([to_triplet(target)], seeds=[SEED])
+    (clip,) = generator.generate([triplet], seeds=[SEED])
     return clip.frames, score(clip.frames[1:], target.frames[1:])["psnr"]
 
 

@@ -11,13 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from egosim_jax.cli import view
 from egosim_jax.cli.__main__ import main
 from egosim_jax.experiments import update
 from egosim_jax.io.video import probe_video
-from egosim_jax.rendering.portrait import portrait
 from egosim_jax.state.snapshot import load, read_ply
-from egosim_jax.types import SceneState, VideoSpec
+from egosim_jax.types import VideoSpec
 
 
 def simulate(weights: Path, out: Path, *more: str) -> int:
@@ -79,20 +77,6 @@ def test_a_folder_of_another_run_is_refused(simulated, weights, capsys):
         assert named in capsys.readouterr().err
 
 
-def test_without_update_the_state_stays(weights, tmp_path):
-    assert simulate(weights, tmp_path / "run", "--update", "none") == 0
-    states = [(tmp_path / "run" / f"state_{number}.ply").read_bytes() for number in range(3)]
-    assert states[0] == states[1] == states[2]
-
-
-@pytest.mark.parametrize("bad", ["missing.png", "small.png"])
-def test_a_first_frame_that_does_not_fit_is_refused(weights, tmp_path, capsys, bad):
-    Image.new("RGB", (8, 8)).save(tmp_path / "small.png")
-    given = ["--first-frame", str(tmp_path / bad)]
-    assert simulate(weights, tmp_path / "run", *given) == 2
-    assert bad in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("bad", "message"),
     [("clasical", "Did you mean 'classical'"), ("classical --hands.discs 0", "discs must be")],
@@ -115,32 +99,6 @@ def test_a_state_and_a_point_cloud_are_drawn_from_three_sides(simulated, tmp_pat
     count = len(load(simulated / "clip_1" / "state").points_m)
     assert f"{count} points" in capsys.readouterr().out
     assert (tmp_path / "0.png").read_bytes() == (tmp_path / "1.png").read_bytes()
-
-
-@pytest.mark.parametrize(("up", "top"), [("z", [0, 0, 1]), ("-y", [0, -1, 0])])
-def test_what_is_up_is_drawn_above(up, top):
-    """Two balls: a red one above a green one."""
-    rng = np.random.default_rng(0)
-    ball = 0.05 * rng.normal(size=(500, 3))
-    state = SceneState(
-        points_m=np.concatenate([ball, ball + 0.4 * np.array(top)]).astype(np.float32),
-        colors=np.repeat(np.array([[0, 255, 0], [255, 0, 0]], np.uint8), 500, axis=0),
-        object_ids=np.zeros(1000, np.int32),
-        last_seen=np.zeros(1000, np.int32),
-        intrinsics_px=np.eye(3),
-    )
-    for image in portrait(state, up=up):
-        red, green = (np.argwhere(image[..., k] > 0)[:, 0].mean() for k in (0, 1))
-        assert red < green - 50
-
-
-def test_what_cannot_be_looked_at_is_named(tmp_path, simulated, capsys, monkeypatch):
-    for path in (tmp_path / "nothing", tmp_path):
-        assert main(["view", str(path)]) == 2
-        assert str(path) in capsys.readouterr().err
-    monkeypatch.setattr(view, "find_spec", lambda name: None)
-    assert main(["view", str(simulated)]) == 2
-    assert "egosim-jax[viewer]" in capsys.readouterr().err
 
 
 def test_the_experiment_compares_worlds_that_remember_with_one_that_does_not(

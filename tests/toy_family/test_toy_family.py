@@ -34,7 +34,6 @@ from egosim_jax.train.encode import check_encoders
 from egosim_jax.train.fine_tuning import FineTuning
 from egosim_jax.types import InputError, Triplet
 
-pytestmark = pytest.mark.usefixtures("undrawn")
 HERE = Path(__file__).parent
 SPACE_MASK = {
     "parts": (("noisy", 6), ("mask", 4), ("prior", 6), ("hands", 6)),

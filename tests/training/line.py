@@ -1,6 +1,7 @@
 """A line fitted to points: a task that compiles quickly, to test the loop around any task.
 
-As a program: OUT, DATA and JSON of `TrainConfig` fields; reading never ends at record `hang`.
+As a program: OUT, DATA and JSON of `TrainConfig` fields; reading never ends at record `hang`, and
+`validates` on DATA.
 """
 
 import json
@@ -17,6 +18,7 @@ from flax import nnx
 
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.models.layers import Linear
+from egosim_jax.runtime import preemption
 from egosim_jax.runtime.command import ExitCode, run_with_exit_codes
 from egosim_jax.train.config import OptimizerConfig, TrainConfig
 from egosim_jax.train.distributed import training_context
@@ -102,11 +104,14 @@ def main(out: str, data: str, changes: str) -> int:
     """Train as the commands do."""
     settings = json.loads(changes)
     settings["mesh"] = MeshConfig(**settings.pop("mesh", {}))
+    validation = Path(data) if settings.pop("validates", False) else None
     task = Line(pause=settings.pop("pause", 0.0), hang=settings.pop("hang", -1))
 
     def run() -> int:
+        preemption.expect()
         with training_context():
-            train(task, training(**settings), data=Path(data), validation=None, out=Path(out))
+            config = training(**settings)
+            train(task, config, data=Path(data), validation=validation, out=Path(out))
         return ExitCode.DONE
 
     return run_with_exit_codes(run)

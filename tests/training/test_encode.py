@@ -5,6 +5,7 @@ import io
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -25,8 +26,8 @@ from egosim_jax.data.loader import Loader
 from egosim_jax.data.manifest import MANIFEST, read_manifest
 from egosim_jax.data.records import to_bytes
 from egosim_jax.data.shards import ShardReader, ShardWriter
-from egosim_jax.io.video import encode_video
 from egosim_jax.io.weights import hashes
+from egosim_jax.io.writing import encode_video
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.train import encode as encoding
 from egosim_jax.train.distributed import free_local_address
@@ -357,6 +358,36 @@ def test_one_of_two_processes_is_killed_and_one_process_goes_on(weights, tmp_pat
     first, second = read_manifest(out), read_manifest(tmp_path / "whole")
     assert first == second
     assert json.loads((out / "config.json").read_text("utf-8"))["config"] == "debug"
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_sigterm_ends_an_encoding_with_75_and_it_goes_on(weights, tmp_path, count):
+    clips = write_clips(tmp_path / "clips", DEBUG.video, count=24, frames=13)
+    out, address = tmp_path / "out", free_local_address()
+    options = ["--config", "debug", "--weights", str(weights), "--shards", str(clips)]
+    options += ["--out", str(out), "--shard-windows", "2"]
+    joins = {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": "2"}
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-m", "egosim_jax.cli", "data", "encode", *options],
+            env=os.environ
+            | flags.devices(1)
+            | ({**joins, "JAX_PROCESS_ID": str(index)} if count == 2 else {}),
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for index in range(count)
+    ]
+    while processes[-1].poll() is None and not list(out.glob(f"parts/*{count - 1}/{MANIFEST}")):
+        time.sleep(0.01)
+    for process in processes:
+        process.send_signal(signal.SIGTERM)
+    said = [process.communicate(timeout=120)[1] for process in processes]
+    assert {process.returncode for process in processes} == {ExitCode.RESUBMIT}, said
+    assert not (out / MANIFEST).exists()
+    assert list(out.glob(f"parts/*/{MANIFEST}"))
+    assert main(["data", "encode", *options]) == 0
+    assert len(ShardReader(out)) == 24
 
 
 def test_the_decoding_of_videos_is_recorded(weights, tmp_path):

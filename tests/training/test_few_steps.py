@@ -87,14 +87,9 @@ def test_samples_at_random_times_have_the_ordinary_loss(networks, batch):
 def test_a_batch_is_divided_among_the_steps():
     assert FewSteps(model=MODEL).bounds(128, 2) == [16, 72, 128]
     assert FewSteps(model=MODEL, others=0.0).bounds(3, 3) == [0, 1, 2, 3]
-
-
-def test_a_batch_may_be_smaller_than_the_number_of_steps(networks, batch):
-    task = FewSteps(model=MODEL)
-    two = {name: array[:2] for name, array in batch.items()}
-    loss, metrics = task.loss(networks, two, task.keys(jax.random.key(0), 2))
-    assert np.isfinite(loss)
-    assert metrics.keys() == {"loss_step_1", "loss_step_3"}  # no sample for the second
+    assert FewSteps(model=MODEL, others=0.5).bounds(3, 3) == [0, 1, 2, 3]
+    with pytest.raises(InputError, match="batch-size"):
+        FewSteps(model=MODEL).bounds(2, 3)
 
 
 def test_models_that_do_not_predict_velocities_of_complete_clips_are_refused():

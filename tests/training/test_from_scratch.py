@@ -1,10 +1,54 @@
 """Training and validation clips of metadata with and without a split."""
 
+import json
+import os
+import subprocess
+import sys
+
 import pytest
 
 from egosim_jax.data.metadata import read_metadata
+from egosim_jax.runtime.command import ExitCode
 from egosim_jax.train.from_scratch import select_split
 from egosim_jax.types import InputError
+from tests import flags
+
+STAGES = ("vae", "denoiser")
+
+
+def train(*options, devices):
+    """The finished program."""
+    return subprocess.run(
+        [sys.executable, "-m", "egosim_jax.train", *map(str, options)],
+        env=os.environ | flags.devices(devices),
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
+
+
+def test_a_batch_that_the_devices_cannot_share_is_refused_before_the_data(tmp_path):
+    refused = train("real_tiny", "--metadata", "none.csv", "--out", tmp_path / "run", devices=3)
+    assert refused.returncode == ExitCode.USAGE
+    assert "A batch of 2 cannot be shared" in refused.stderr
+    assert "--vae.batch-size" in refused.stderr
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_debug_trains_on_three_devices_and_keeps_its_options_from_the_first_update(tmp_path):
+    out = tmp_path / "run"
+    fixed = ("debug", "--clips", 4, "--clip-frames", 9, "--denoiser.steps", 1, "--out", out)
+    # Crops that no frame has: the data are made, and no update.
+    failed = train(*fixed, "--vae.steps", 2, "--crop", 4096, 4096, devices=3)
+    assert failed.returncode == ExitCode.USAGE, failed.stderr
+    done = train(*fixed, "--vae.steps", 1, devices=3)
+    assert done.returncode == ExitCode.DONE, done.stderr
+    configs = [json.loads((out / stage / "config.json").read_text()) for stage in STAGES]
+    assert [config["training"]["batch_size"] for config in configs] == [3, 3]
+    changed = train(*fixed, "--vae.steps", 2, devices=3)
+    assert changed.returncode == ExitCode.USAGE
+    assert "vae.steps" in changed.stderr
 
 
 @pytest.fixture

@@ -21,8 +21,9 @@ from tests.training.line import write_points
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
-LONG = {"steps": 100, "save_every": 30, "pause": 0.03}
-"""A run of several seconds: jax checks for SIGTERM once a second."""
+STEPS = 40
+LONG = {"steps": STEPS, "save_every": 7, "validate_every": 10, "validates": True, "pause": 0.03}
+"""A run of several seconds."""
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +31,15 @@ def points(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_points(tmp_path_factory.mktemp("points"))
 
 
-def start(out: Path, data: Path, *, devices: int = 1, env: dict[str, str] | None = None, **changes):
+def start(
+    out: Path,
+    data: Path,
+    *,
+    devices: int = 1,
+    env: dict[str, str] | None = None,
+    new_group: bool = False,
+    **changes,
+):
     command = [sys.executable, "-m", "tests.training.line", str(out), str(data)]
     return subprocess.Popen(
         [*command, json.dumps(changes)],
@@ -38,6 +47,7 @@ def start(out: Path, data: Path, *, devices: int = 1, env: dict[str, str] | None
         env=os.environ | flags.devices(devices) | (env or {}),
         stderr=subprocess.PIPE,
         text=True,
+        start_new_session=new_group,
     )
 
 
@@ -48,9 +58,14 @@ def run(out: Path, data: Path, **settings) -> str:
     return said
 
 
+def updates(out: Path) -> int:
+    """Finished updates, by the log."""
+    return max((int(line["step"]) for line in logged(out)), default=0)
+
+
 def wait_for(out: Path, step: int, *processes: subprocess.Popen) -> None:
     deadline = time.monotonic() + 300
-    while not (out / "metrics.jsonl").is_file() or len(logged(out)) < step:
+    while updates(out) < step:
         ended = [process.communicate()[1] for process in processes if process.poll() is not None]
         assert not ended, f"it ended too early: {ended}"
         assert time.monotonic() < deadline
@@ -64,20 +79,55 @@ def straight(points: Path, tmp_path_factory: pytest.TempPathFactory) -> list[dic
     return logged(out)
 
 
-def test_sigterm_saves_the_step_and_ends_with_75_and_the_rest_is_the_same(
+@pytest.mark.parametrize("workers", [0, 2])
+def test_sigterm_is_heard_at_the_next_update_and_the_rest_is_the_same(
+    points, straight, tmp_path, workers
+):
+    """At first, after a save, at a validation, and as Slurm: to all processes."""
+    out, settings = tmp_path / "run", LONG | {"workers": workers}
+    for step in (1, 7, 10) if not workers else (9,):
+        process = start(out, points, new_group=True, **settings)
+        wait_for(out, step, process)
+        os.killpg(process.pid, signal.SIGTERM)
+        before = updates(out)
+        said = process.communicate(timeout=120)[1]
+        assert process.returncode == ExitCode.RESUBMIT, said
+        assert before <= updates(out) <= before + 1
+        assert f"saved after step {updates(out)}" in said
+    assert f"resuming at step {updates(out)} of" in run(out, points, **settings)
+    assert logged(out) == straight
+
+
+def test_sigterm_before_the_first_update_ends_with_75_and_leaves_nothing(
     points, straight, tmp_path
 ):
     out = tmp_path / "run"
     process = start(out, points, **LONG)
-    wait_for(out, 9, process)
+    while not (out / "config.json").exists():  # then it reads a batch and compiles
+        assert process.poll() is None
+        time.sleep(0.001)
     process.send_signal(signal.SIGTERM)
     said = process.communicate(timeout=120)[1]
     assert process.returncode == ExitCode.RESUBMIT, said
-    done = len(logged(out))
-    assert f"saved after step {done}" in said
-    assert done < LONG["steps"]
-    assert f"resuming at step {done} of" in run(out, points, **LONG)
+    assert said.endswith("stopped; run the same command again\n")
+    assert logged(out) == []
+    run(out, points, **LONG)
     assert logged(out) == straight
+
+
+@pytest.mark.parametrize("command", [["train", "debug"], ["data", "encode"]])
+def test_sigterm_during_imports_ends_with_75(command):
+    process = subprocess.Popen(
+        [sys.executable, "-X", "importtime", "-m", "egosim_jax.cli", *command],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stderr is not None
+    while "numpy" not in process.stderr.readline():
+        pass
+    process.send_signal(signal.SIGTERM)
+    assert "run the same command again" in process.communicate(timeout=120)[1]
+    assert process.returncode == ExitCode.RESUBMIT
 
 
 def test_a_run_that_hangs_prints_its_stacks_and_ends_with_70(points, tmp_path):
@@ -128,18 +178,22 @@ def test_two_processes_stop_together_and_resume_bit_for_bit(points, tmp_path):
     schedule = LONG | {"pause": 0.06}
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     assert finish(pair(whole, points, **schedule)) == [ExitCode.DONE, ExitCode.DONE]
+    for step, receiver in ((9, 1), (16, 0)):  # after a save, and after a resume and a save
+        processes = pair(stopped, points, **schedule)
+        wait_for(stopped, step, *processes)
+        processes[receiver].send_signal(signal.SIGTERM)
+        before = updates(stopped)
+        assert finish(processes) == [ExitCode.RESUBMIT, ExitCode.RESUBMIT]
+        assert before <= updates(stopped) <= before + 2  # the signal is passed on first
     processes = pair(stopped, points, **schedule)
-    wait_for(stopped, 9, *processes)
-    processes[1].send_signal(signal.SIGTERM)
-    assert finish(processes) == [ExitCode.RESUBMIT, ExitCode.RESUBMIT]
-    processes = pair(stopped, points, **schedule)
-    wait_for(stopped, len(logged(stopped)) + 9, *processes)
+    wait_for(stopped, updates(stopped) + 9, *processes)
     for process in processes:
         process.kill()
         process.communicate()
     assert finish(pair(stopped, points, **schedule)) == [ExitCode.DONE, ExitCode.DONE]
     assert logged(stopped) == logged(whole)
-    assert [line["step"] for line in logged(whole)] == list(range(1, schedule["steps"] + 1))
+    steps = [line["step"] for line in logged(whole) if "loss" in line]
+    assert steps == list(range(1, STEPS + 1))
 
 
 @pytest.mark.parametrize(
@@ -168,7 +222,7 @@ def test_sigterm_ends_the_making_of_clips_with_75(tmp_path):
     process = subprocess.Popen(
         [*command, "--out", str(out)], cwd=ROOT, stderr=subprocess.PIPE, text=True
     )
-    parts, deadline = out / "frames" / "train" / "parts", time.monotonic() + 120
+    parts, deadline = out / "frames" / "train" / "parts", time.monotonic() + 300
     while len(list(parts.glob("*.record"))) < 2:
         assert process.poll() is None
         assert time.monotonic() < deadline

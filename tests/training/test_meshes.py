@@ -16,7 +16,7 @@ from tests.training.run_tiny import TASKS
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
-MESHES = [(1, 8, 1, 1), (1, 4, 2, 2), (2, 2, 2, 1)]
+MESHES = [(1, 4, 2, 2), (2, 2, 2, 1)]
 """Sizes of data, fsdp and context, and number of gradient accumulation steps."""
 
 

@@ -9,8 +9,6 @@ from egosim_jax.train.config import OptimizerConfig
 from egosim_jax.train.loop import train
 from tests.training.line import Line, training, write_points
 
-pytestmark = pytest.mark.usefixtures("undrawn")
-
 
 def values(networks) -> np.ndarray:
     return np.concatenate([np.ravel(networks.kernel[...]), np.ravel(networks.bias[...])])
@@ -33,12 +31,9 @@ def test_a_decay_too_slow_for_the_run_keeps_most_of_what_was_learned(decay, step
     np.testing.assert_array_equal(again, mean)
 
 
-@pytest.mark.parametrize(("decay", "steps"), [(0.9, 11), (0.999, 1099), (0.9999, 11_000)])
-def test_a_decay_that_catches_up_is_constant(decay, steps):
+@pytest.mark.parametrize("decay", [0.9, 0.9999])
+def test_the_average_is_warmed_up(decay):
     optimizer = OptimizerConfig(ema_decay=decay)
-    assert optimizer.ema_decay_at(jnp.int32(0), steps) == decay
-    first, later, last = (
-        float(optimizer.ema_decay_at(jnp.int32(n), steps // 2)) for n in (0, 2, 10**6)
-    )
+    first, later, last = (float(optimizer.ema_decay_at(jnp.int32(n))) for n in (0, 2, 10**6))
     assert (first, later) == pytest.approx((1 / 10, 3 / 12))
     assert last == pytest.approx(decay)

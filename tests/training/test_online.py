@@ -14,12 +14,9 @@ from egosim_jax import configs
 from egosim_jax.configs.model import Networks
 from egosim_jax.diffusion.objective import Objective
 from egosim_jax.diffusion.process import RectifiedFlow
-from egosim_jax.io import parts, weights
-from egosim_jax.models import abstract
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.train.__main__ import main as egosim_train
 from egosim_jax.train.config import OptimizerConfig, make_optimizer
-from egosim_jax.train.deepen import deepen_weights
 from egosim_jax.train.online.latents import read_latents, write_shard
 from egosim_jax.train.online.plan import OnlineTraining
 from egosim_jax.train.online.pool import CHUNK, Pool, latent_shapes, raw_shapes
@@ -44,7 +41,7 @@ def rows_of(count, seed=0):
 
 
 def test_a_seed_gives_the_same_clips_and_every_kind_of_scene_occurs(tmp_path):
-    scenes = EndlessScenes(model=SMALL, clips=1, attempts=0.0, idle=0.5)
+    scenes = EndlessScenes(model=SMALL, clips=1, attempts=0.0, encounters=0.0, idle=0.5)
     first, second = ([next(scenes.clips_of(seed)) for seed in range(n)] for n in (6, 3))
     for one, other in zip(first, second, strict=False):
         np.testing.assert_array_equal(one.frames, other.frames)
@@ -60,9 +57,8 @@ def test_a_seed_gives_the_same_clips_and_every_kind_of_scene_occurs(tmp_path):
 
 
 def test_fused_states_have_what_the_frames_show_and_need_no_other_clips():
-    moved, fused = (
-        EndlessScenes(model=SMALL, fused=share, idle=0.0, attempts=0.0) for share in (0.0, 1.0)
-    )
+    scripts = EndlessScenes(model=SMALL, idle=0.0, attempts=0.0, encounters=0.0)
+    moved, fused = (replace(scripts, fused=share) for share in (0.0, 1.0))
     one, other = (list(scenes.triplets(3)) for scenes in (moved, fused))
     np.testing.assert_array_equal(one[0].prior, other[0].prior)
     np.testing.assert_array_equal(one[1].target, other[1].target)
@@ -105,25 +101,6 @@ def test_a_full_pool_forgets_its_oldest_clips():
     np.testing.assert_array_equal(pool.arrays["ids"][CHUNK:], rows_of(CHUNK, 1)["ids"])
     with pytest.raises(ValueError, match="multiple of 16"):
         Pool(latent_shapes(DEBUG, CHUNK + 1))
-
-
-def test_a_deeper_denoiser_computes_the_same(tmp_path):
-    networks = Networks.random(DEBUG, seed=0)
-    networks.save(tmp_path / "two")
-    folder = deepen_weights(tmp_path / "two", 3, tmp_path / "deep")
-    deep = abstract(replace(DEBUG.dit, layers=3))
-    weights.load(folder / "dit.safetensors", deep)
-    draw = np.random.default_rng(0)
-    shapes = ((1, 3, 4, 4, 52), (1, 5, DEBUG.dit.text_dim), (1, 5, DEBUG.dit.image_dim))
-    latents, text, image = (jnp.asarray(draw.normal(size=s), jnp.float32) for s in shapes)
-    inputs = latents, jnp.array([500.0]), text, image
-    answer = nnx.jit(lambda network: network(*inputs))
-    expected, found = answer(networks.dit), answer(deep)
-    np.testing.assert_allclose(found, expected, atol=1e-6)
-    assert (folder / "vae.safetensors").exists()
-    assert deepen_weights(tmp_path / "two", 2, tmp_path / "same") == tmp_path / "two"
-    with pytest.raises(InputError, match="2 to 4 blocks, not to 5"):
-        deepen_weights(tmp_path / "two", 5, tmp_path / "more")
 
 
 def test_grouped_muon_equals_muon_of_each_weight():
@@ -198,17 +175,21 @@ def test_the_schedule_falls_to_a_hundredth():
 
 
 def test_egosim_train_has_online_training_with_its_own_options(capsys):
+    arguments = ["tabletop", "--online", "--minutes", "1"]
     with pytest.raises(SystemExit) as ended:
-        egosim_train(["tabletop", "--online", "--minutes", "1"], program="egosim train")
+        egosim_train(arguments, program="egosim train")
     assert ended.value.code == ExitCode.USAGE
-    said = capsys.readouterr().err
-    assert "usage: egosim train tabletop --online" in said
-    assert "required: --out" in said
+    assert "--out" in capsys.readouterr().err
 
 
 def test_a_training_without_an_end_is_refused(tmp_path):
     with pytest.raises(InputError, match="needs an end"):
-        OnlineTraining(model=DEBUG, start=tmp_path, out=tmp_path)
+        OnlineTraining(minutes=None, out=tmp_path)
+
+
+def test_a_model_without_shipped_weights_needs_some(tmp_path):
+    with pytest.raises(InputError, match=r"debug has no weights.*--weights"):
+        OnlineTraining(config="debug", out=tmp_path)
 
 
 @pytest.mark.slow
@@ -216,12 +197,12 @@ def test_a_run_is_the_same_in_programs_of_two_updates_and_when_it_was_interrupte
     Networks.random(DEBUG, seed=0).save(tmp_path / "start")
     (tmp_path / "latents").mkdir()
     write_shard(tmp_path / "latents" / "a.npz", rows_of(2 * CHUNK))
-    model = replace(DEBUG, dit=replace(DEBUG.dit, layers=3))
 
     def train(out, per_program, *, until=9):
         plan = OnlineTraining(
-            model=model, start=tmp_path / "start", out=tmp_path / out, updates=4, workers=0,
-            latents=tmp_path / "latents", batch=2, per_program=per_program, decoder_share=0.0,
+            config="debug", weights=tmp_path / "start", out=tmp_path / out, minutes=None,
+            updates=4, workers=0,
+            latents=tmp_path / "latents", batch=4, per_program=per_program, decoder_share=0.0,
             first_clips=CHUNK, clips=2 * CHUNK, frames=CHUNK, save_s=0.0,
         )  # fmt: skip
         run = OnlineRun(plan)
@@ -248,5 +229,4 @@ def test_a_run_is_the_same_in_programs_of_two_updates_and_when_it_was_interrupte
     assert int(one.state.step) == int(two.state.step) == 4
     for a, b in zip(*(jax.tree.leaves(run.state.params) for run in (one, two)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)
-    parts.join(tmp_path / "one" / "weights", tmp_path / "joined")
-    Networks.load(model, tmp_path / "joined")
+    Networks.load(DEBUG, tmp_path / "one" / "weights")

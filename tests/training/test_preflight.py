@@ -66,7 +66,6 @@ def test_json_has_the_memory_and_what_does_not_fit_ends_with_1(capsys):
     assert not report["fits"]
     assert report["peak"] == sum(report["memory"].values()) > report["capacity"] == 1e6
     assert report["hardware_flops"] > report["model_flops"] > 0
-    assert len(report["largest"]) == 10
 
 
 @pytest.mark.parametrize(
@@ -133,7 +132,7 @@ def room(compiled, monkeypatch):
             needed = replace(measured.memory, temporaries=0 if setting in fits else 10**12)
             seconds = {"offload": 4.5, "full": 4.0, "attention": 3.5}.get(setting.remat, 3.0)
             seconds += 0.2 / setting.clips
-            return replace(measured, memory=needed, compute_s=seconds, memory_s=0.0, link_s=0.0)
+            return replace(measured, memory=needed, roofline_s=seconds)
 
         def compile_step(stage, target):
             tried.append(module._setting(stage, target))

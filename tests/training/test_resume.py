@@ -1,7 +1,4 @@
-"""Interrupted runs continue as if nothing had happened.
-
-`python -m tests.endurance` does the same twenty times.
-"""
+"""Interrupted runs continue as if nothing had happened."""
 
 import pytest
 
@@ -21,7 +18,7 @@ STEPS, SAVE_EVERY = 8, 3
         pytest.param("student_dmd", marks=pytest.mark.slow),
     ],
 )
-def test_a_killed_run_repeats_losses_and_weights_bit_for_bit(task, tmp_path, undrawn):
+def test_a_killed_run_repeats_losses_and_weights_bit_for_bit(task, tmp_path):
     latents, whole = tmp_path / "latents", tmp_path / "whole"
     write_latents(latents, TASKS[task].model)
     fit(latents, whole, steps=STEPS, save_every=SAVE_EVERY, task=task)

@@ -16,7 +16,6 @@ from egosim_jax.types import MeshConfig
 from tests.training.killing import logged
 from tests.training.line import Line, training, write_points
 
-pytestmark = pytest.mark.usefixtures("undrawn")
 STEPS, PEAK = 10, 0.1
 
 

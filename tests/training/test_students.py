@@ -11,14 +11,18 @@ from jax.sharding import Mesh
 
 from egosim_jax import configs
 from egosim_jax.configs.model import Networks
+from egosim_jax.data.shards import ShardReader
 from egosim_jax.models.chunks import Chunks
+from egosim_jax.runtime.command import CommandExit
 from egosim_jax.train import recipes
 from egosim_jax.train.config import CriticConfig, OptimizerConfig, TrainConfig
+from egosim_jax.train.monitor import SkipMonitor
 from egosim_jax.train.task import Roles
 from egosim_jax.train.tasks.consistency import Consistency
 from egosim_jax.train.tasks.matching import Matching
-from egosim_jax.train.update import Programs
+from egosim_jax.train.update import Programs, mean_metrics
 from egosim_jax.types import InputError, VideoSpec
+from tests.training.line import write_points
 
 DEBUG = configs.get("debug")
 MODEL = dataclasses.replace(
@@ -184,6 +188,31 @@ def test_an_update_trains_the_critic_several_times_and_never_the_teacher():
     assert float(state.params["value"][0]) == pytest.approx(1.1, abs=1e-3)
     assert float(state.teacher["value"][0]) == 3
     assert {"critic_loss", "critic_grad_norm", "loss"} <= metrics.keys()
+
+
+@dataclasses.dataclass(frozen=True)
+class Diverging(Following):
+    """The same with a critic whose every update is NaN."""
+
+    def critic_loss(self, roles, batch, keys):
+        return jnp.nan * roles.critic.value[...].sum(), {}
+
+
+def test_a_critics_skipped_updates_are_counted_and_end_the_run(tmp_path):
+    training = TrainConfig(steps=4, batch_size=2, optimizer=OptimizerConfig(learning_rate=0.1))
+    mesh = Mesh(np.array(jax.devices()[:1]).reshape(1, 1, 1), ("data", "fsdp", "context"))
+    programs = Programs.of(Diverging(), training, mesh)
+    with jax.set_mesh(mesh):
+        state = programs.create(None, nnx.state(Number()))
+        state, metrics = programs.update(state, programs.frozen, {"x": jnp.zeros(2)})
+    assert int(metrics["critic_consecutive_skips"]) == 3
+    means = mean_metrics([metrics])
+    assert means["skipped_critic_updates"] == 3
+    assert np.isfinite(list(means.values())).all()
+    monitor = SkipMonitor(ShardReader(write_points(tmp_path / "points")))
+    monitor.watch(1, metrics, np.zeros(0, int))
+    with pytest.raises(CommandExit, match="by the critic"):
+        monitor.check()
 
 
 @pytest.mark.parametrize(

@@ -13,14 +13,19 @@ FUNCTIONS = sorted(set(re.findall(r"`([\w/]+\.py):([\w.]+)`", PAGE)))
 FILES = sorted(set(re.findall(r"`((?:egosim_jax|train|convert)/[\w/]+?(?:\.py)?)[:`]", PAGE)))
 
 
+def names(node):
+    """The names that a statement defines: a function, a class, or a value."""
+    targets = [node.target] if isinstance(node, ast.AnnAssign) else getattr(node, "targets", [])
+    return [getattr(node, "name", None), *(getattr(target, "id", None) for target in targets)]
+
+
 @pytest.mark.parametrize(("file", "name"), FUNCTIONS)
 def test_a_named_function_exists(file, name):
     scope = ast.parse((ROOT / file).read_text()).body
-    for part in name.split("."):
-        kinds = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
-        found = [node for node in scope if isinstance(node, kinds) and node.name == part]
-        assert found, f"{file} has no {name}"
-        scope = found[0].body
+    for step in name.split("."):
+        named = {key: node for node in scope for key in names(node)}
+        assert step in named, f"{file} has no {name}"
+        scope = getattr(named[step], "body", [])
 
 
 def test_all_three_call_paths_are_named():

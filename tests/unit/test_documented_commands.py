@@ -17,10 +17,9 @@ import yaml
 
 from egosim_jax.cli.commands import Commands
 from egosim_jax.convert.__main__ import Commands as Conversions
-from egosim_jax.runtime.command import ExitCode
+from egosim_jax.runtime.command import ExitCode, parse
 from egosim_jax.train.__main__ import Commands as Recipes
-from egosim_jax.train.launch import Launch
-from egosim_jax.train.online.__main__ import make_parser
+from egosim_jax.train.online.plan import OnlineTraining
 
 ROOT = Path(__file__).parents[2]
 PROGRAMS = {"egosim": Commands, "egosim-train": Recipes, "egosim-convert": Conversions}
@@ -33,7 +32,7 @@ PATHS = [
 
 
 COMMAND = re.compile(
-    r"^    (?:srun .*? |python -m egosim_jax.train.launch .*?-- )?(?:[A-Z_]+=\S+ )*"
+    r"^    (?:srun .*? )?(?:[A-Z_]+=\S+ )*"
     r"(egosim(?:-train|-convert)? .*?)(?: &)?$",
     re.M,
 )
@@ -48,7 +47,6 @@ FENCED = {
     "streaming.md": None,  # names stand for your own model and policy
 }
 """Test that runs the fenced Python of each page; None if it is only compiled."""
-LAUNCH = re.compile(r"^    python -m egosim_jax.train.launch (.*? -- .*)$", re.M)
 DRY_RUN = re.compile(r"^#   (egosim train .* --preflight .*)$", re.M)
 SLURM = ROOT / "examples" / "slurm" / "egosim_14b.sbatch"
 PODS = {path.stem: path for path in sorted((ROOT / "examples" / "gke").glob("*.yaml"))}
@@ -136,9 +134,9 @@ def test_a_command_is_understood(command):
     if program == "egosim" and args[0] in ("train", "convert"):
         program = f"egosim-{args.pop(0)}"
     if args[:2] == ["tabletop", "--online"]:
-        make_parser().parse_args(args[2:])
+        tyro.cli(OnlineTraining, args=args[2:])
         return
-    tyro.cli(PROGRAMS[program], args=args, config=(tyro.conf.OmitSubcommandPrefixes,))
+    parse(PROGRAMS[program], args, program=program)
 
 
 def training(command: str) -> list[tuple[str, str]]:
@@ -218,13 +216,3 @@ def test_slurm_starts_it_again_unless_it_would_fail_again(tmp_path, code, restar
     assert lines[1:] == ["scontrol requeue 7"] * requeued
     dry = subprocess.run(["bash", SLURM], env=env, capture_output=True, text=True)
     assert dry.stdout == shlex.join(slurm_array()[1:]) + " --preflight h200:32 --no-search\n"
-
-
-def test_options_of_the_launcher_are_understood():
-    found = [
-        tyro.cli(Launch, args=shlex.split(options))
-        for path in PATHS
-        for options in LAUNCH.findall(path.read_text("utf-8"))
-    ]
-    assert {launch.program[0] for launch in found} == {"egosim"}
-    assert {launch.nodes for launch in found} == {1, 2}

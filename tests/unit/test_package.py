@@ -5,11 +5,9 @@ import re
 import subprocess
 import sys
 import tomllib
-from graphlib import TopologicalSorter
 from pathlib import Path
 from urllib.parse import urlsplit
 
-import grimp
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
@@ -64,13 +62,6 @@ def test_optional_packages_are_never_imported_at_module_level():
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             offenders += [f"{path}: {n}" for n in names if n.partition(".")[0] in OPTIONAL]
     assert not offenders
-
-
-def test_no_modules_import_each_other_in_a_circle():
-    """Imports inside functions, and those for type checkers alone, count like all others."""
-    graph = grimp.build_graph("egosim_jax", exclude_type_checking_imports=False, cache_dir=None)
-    imported = {name: graph.find_modules_directly_imported_by(name) for name in graph.modules}
-    TopologicalSorter(imported).prepare()  # raises with the modules of a circle
 
 
 def parsed(text: str) -> tuple:

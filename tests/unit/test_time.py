@@ -10,12 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from egosim_jax.annotate.sources import find_sources, open_source
-from egosim_jax.data.clip_files import ClipFiles
-from egosim_jax.data.clips import load_triplet
 from egosim_jax.data.importing import import_recordings
-from egosim_jax.data.metadata import read_metadata
-from egosim_jax.data.pack import pack
 from egosim_jax.data.readers.agibot import AgiBot
 from egosim_jax.data.readers.egodex import EgoDex
 from egosim_jax.data.readers.egosim import EgoSimClips
@@ -24,10 +19,8 @@ from egosim_jax.data.readers.hot3d import Hot3D
 from egosim_jax.data.readers.lerobot import LeRobot
 from egosim_jax.data.readers.taste_rob import TasteRob
 from egosim_jax.data.recording import Recording
-from egosim_jax.evaluation.methods import Shape, read_at
-from egosim_jax.io.segments import probe_long_video, read_segment
 from egosim_jax.io.timing import Timeline, row_times
-from egosim_jax.io.video import probe_video, read_video
+from egosim_jax.io.video import probe_video, read_moments, read_video
 from egosim_jax.types import InputError, VideoSpec
 from tests.captures import World
 from tests.films import EVEN, FILMS, FPS, FRAMES, HEIGHT, WIDTH, numbers, write_film, write_paused
@@ -133,63 +126,6 @@ def imported(reader, out):
     return [Recording.load(out / o.recording_id) for o in outcomes if not o.problem], problems
 
 
-def make_clip(folder, film):
-    paths = {name: folder / f"{name}.mp4" for name in ("prior", "hands", "target")}
-    for path in paths.values():
-        shutil.copy(film, path)
-    return ClipFiles(
-        video_id="a", prompt="wave", mask=None, first_frame=paths["prior"], extra={}, row="1",
-        **paths,
-    )  # fmt: skip
-
-
-def by_annotate(folder, film):
-    return open_source(find_sources([film])[0]).read_frames().frames
-
-
-def by_pack(folder, film):
-    return load_triplet(make_clip(folder, film), SPEC, policy="lenient").target
-
-
-def by_rate(folder, film):
-    clip = make_clip(folder, film)
-    return load_triplet(clip, RATED, policy="lenient", resampling="rate").hands
-
-
-def by_list(folder, film):
-    """Load the clip of a DWM list."""
-    for name in ("videos", "videos_hands", "videos_static"):
-        (folder / "a" / name).mkdir(parents=True)
-        shutil.copy(film, folder / "a" / name / "0.mp4")
-    (folder / "a/prompts").mkdir()
-    (folder / "a/prompts/0.txt").write_text("wave")
-    (folder / "list.txt").write_text("a/videos/0.mp4\n")
-    (clip,) = read_metadata(folder / "list.txt")
-    return load_triplet(clip, SPEC, policy="lenient").target
-
-
-def by_evaluate(folder, film):
-    probe_video(film)
-    return read_at(film, Shape(9, HEIGHT, WIDTH), 0)
-
-
-def by_segment(folder, film):
-    info = probe_long_video(film)
-    parts = [(0, 5), (5, 6), (11, info.frames - 11)]
-    return np.concatenate([read_segment(film, start=s, count=n).frames for s, n in parts])
-
-
-PATHS = {
-    "annotate": by_annotate,
-    "pack": by_pack,
-    "pack by rate": by_rate,
-    "DWM list": by_list,
-    "evaluate": by_evaluate,
-    "segments": by_segment,
-    "video": lambda _, film: read_video(film).frames,
-}
-
-
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     """Return a function that writes a film once and gives its path."""
@@ -204,33 +140,30 @@ def written(tmp_path_factory):
     return write
 
 
-def pairs(names, thorough):
-    """Return every film with some names, and every name with two films."""
-    few = ("missing frame", "edit list")
-    return [(film, name) for film in FILMS for name in names if name in thorough or film in few]
+@pytest.mark.parametrize("film", FILMS)
+def test_a_frame_is_the_one_of_its_time(film, written):
+    path, (_, expected) = written(film), FILMS[film]
+    assert probe_video(path).frames == len(expected)
+    parts = [slice(None), slice(0, 5), slice(5, 11), slice(11, len(expected))]
+    for part in parts:
+        video = read_video(path, start=part.start or 0, stop=part.stop)
+        assert numbers(video.frames) == expected[part]
+    moments = read_moments(path, np.array([0.1, 0.1, 0.3, 11 / 30]))
+    assert numbers(moments.frames) == [expected[k] for k in (3, 3, 9, 11)]
 
 
-@pytest.mark.parametrize(("film", "reader"), pairs(READERS, ("lerobot v3.0", "egosim")))
-def test_a_frame_is_the_one_of_its_time(film, reader, written, tmp_path):
-    _, expected = FILMS[film]
-    dataset = READERS[reader](tmp_path / "set", written(film), len(expected))
+@pytest.mark.parametrize("reader", READERS)
+def test_every_reader_takes_frames_by_time(reader, written, tmp_path):
+    _, expected = FILMS["missing frame"]
+    dataset = READERS[reader](tmp_path / "set", written("missing frame"), len(expected))
     (recording,), problems = imported(dataset, tmp_path / "out")
     assert not problems
     assert recording.fps == FPS
     assert numbers(recording.read_frames().frames) == expected
 
 
-@pytest.mark.parametrize(("film", "path"), pairs(PATHS, ("segments", "video")))
-def test_every_path_takes_the_same_frames(film, path, written, tmp_path):
-    _, expected = FILMS[film]
-    step = 3 if path == "pack by rate" else 1  # 30 to 8 fps
-    found = numbers(PATHS[path](tmp_path, written(film)))
-    wanted = expected[::step][: len(found)]
-    assert found == wanted + wanted[-1:] * (len(found) - len(wanted))
-
-
-@pytest.mark.parametrize("reader", READERS)
-def test_a_variable_rate_is_refused_by_every_reader(reader, tmp_path):
+@pytest.mark.parametrize("reader", ["lerobot v3.0", "egovid"])
+def test_a_variable_rate_is_refused_by_readers(reader, tmp_path):
     film = write_paused(tmp_path / "film.mp4")
     _, problems = imported(READERS[reader](tmp_path / "set", film, FRAMES), tmp_path / "out")
     assert "variable frame rate" in problems[0]
@@ -238,25 +171,17 @@ def test_a_variable_rate_is_refused_by_every_reader(reader, tmp_path):
     assert "`ffmpeg -i IN -vf fps=30 OUT`" in problems[0]
 
 
-@pytest.mark.parametrize("path", PATHS)
-def test_a_variable_rate_is_refused_on_every_path(path, tmp_path):
-    film = write_paused(tmp_path / "film.mp4")
+@pytest.mark.parametrize("read", [probe_video, read_video])
+def test_a_variable_rate_is_refused_with_the_command_that_converts(read, tmp_path):
     with pytest.raises(InputError, match=r"variable frame rate.*-vf fps=30 OUT"):
-        PATHS[path](tmp_path, film)
-
-
-def test_a_clip_of_variable_rate_is_not_packed(tmp_path):
-    clip = make_clip(tmp_path, write_paused(tmp_path / "film.mp4"))
-    problem = next(pack([clip], out=tmp_path / "out", spec=SPEC, provenance={}))
-    assert problem
-    assert "variable frame rate" in problem
+        read(write_paused(tmp_path / "film.mp4"))
 
 
 @pytest.mark.parametrize(
     ("reader", "rows"),
     [
-        *((name, FRAMES + n) for name in READERS if name != "taste_rob" for n in (-7, 1)),
-        *((name, FRAMES + n) for name in ("lerobot v3.0", "egovid") for n in (-1, 9)),
+        *((name, FRAMES - 1) for name in READERS if name != "taste_rob"),
+        *((name, FRAMES + 1) for name in ("lerobot v2.1", "lerobot v3.0", "egovid", "egosim")),
     ],
 )
 def test_of_different_lengths_what_fits_is_used(reader, rows, tmp_path, caplog):
@@ -272,8 +197,59 @@ def test_of_different_lengths_what_fits_is_used(reader, rows, tmp_path, caplog):
     if recording.world_from_camera is not None:
         expected = World(frames=rows).poses[:fits]
         np.testing.assert_allclose(recording.world_from_camera, expected, atol=1e-5)
-    if not (reader.startswith("lerobot") and rows < FRAMES):
+    if not (reader == "lerobot v3.0" and rows < FRAMES):
         assert str(rows) in caplog.text
+
+
+@pytest.mark.parametrize("reader", ["lerobot v2.0", "lerobot v2.1", "egodex", "agibot", "egosim"])
+@pytest.mark.parametrize(
+    ("rows", "fps"), [(22, "27.5"), (20, "25"), (16, "20"), (12, "15"), (28, "35")]
+)
+def test_rows_of_another_rate_are_refused_at_any_ratio(reader, rows, fps, tmp_path):
+    film = write_film(tmp_path / "film.mp4")
+    found, problems = imported(READERS[reader](tmp_path / "set", film, rows), tmp_path / "o")
+    assert not found
+    assert f"24 frames and {rows} " in problems[0]
+    assert f"`ffmpeg -i IN -vf fps={fps} OUT`" in problems[0]
+
+
+def test_states_of_another_rate_than_poses_are_refused(tmp_path):
+    dataset = write_agibot(tmp_path / "set", write_film(tmp_path / "film.mp4"), FRAMES)
+    path = next(tmp_path.rglob("head_extrinsic_params_aligned.json"))
+    path.write_text(json.dumps(json.loads(path.read_text())[:18]))
+    assert "24 frames and 18 camera poses" in imported(dataset, tmp_path / "o")[1][0]
+
+
+UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+@pytest.mark.parametrize("start_s", [0.0, 1.7e9])
+@pytest.mark.parametrize("unit", UNITS)
+def test_time_stamps_in_another_unit_are_named(version, unit, start_s, tmp_path):
+    film = write_film(tmp_path / "film.mp4")
+    stamps = [(start_s + k / 30) * UNITS[unit] for k in range(24)]
+    dataset = write_lerobot(tmp_path / "set", film, 24, version, stamps=stamps)
+    assert f"seems to be in {unit}" in imported(dataset, tmp_path / "out")[1][0]
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+@pytest.mark.parametrize("start_s", [0.3, 26.333, -0.2, 1.7e9])
+def test_time_stamps_that_begin_elsewhere_are_refused(version, start_s, tmp_path):
+    film = write_film(tmp_path / "film.mp4")
+    stamps = [start_s + k / 30 for k in range(24)]
+    dataset = write_lerobot(tmp_path / "set", film, 24, version, stamps=stamps)
+    assert "Subtract its first value" in imported(dataset, tmp_path / "out")[1][0]
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+@pytest.mark.parametrize("stamp", [0.0, 5.5, None, float("nan")])
+def test_rows_without_different_time_stamps_are_at_the_rate(version, stamp, tmp_path, caplog):
+    film = write_film(tmp_path / "film.mp4")
+    dataset = write_lerobot(tmp_path / "set", film, 24, version, stamps=[stamp] * 24)
+    ((recording,), _) = imported(dataset, tmp_path / "out")
+    assert numbers(recording.read_frames().frames) == [*range(24)]
+    assert "does not separate 24 rows" in caplog.text
 
 
 @pytest.mark.parametrize(

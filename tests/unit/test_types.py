@@ -8,7 +8,6 @@ import pytest
 
 from egosim_jax.types import (
     Action,
-    Cameras,
     Clip,
     GroundTruth,
     InputError,
@@ -108,11 +107,6 @@ def test_a_clip_that_is_no_video_is_refused(frames):
 def test_a_seed_out_of_range_is_refused(seed):
     with pytest.raises(InputError, match=r"--seed must be a whole number from 0 to 2\*\*63 - 1"):
         check_seed(seed)
-
-
-def test_cameras_are_checked_as_before():
-    cameras = action().cameras
-    assert Cameras(**vars(cameras)).height == 48
 
 
 K = np.array([[60.0, 0, 39.5], [0, 60, 23.5], [0, 0, 1]])

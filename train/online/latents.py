@@ -9,14 +9,14 @@ mask as bits. The encoder's 16-bit weights round latents more coarsely than that
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+import tyro
 from flax import nnx
 
 from egosim_jax import configs
@@ -24,8 +24,10 @@ from egosim_jax.configs.model import ModelConfig
 from egosim_jax.data.records import stacked
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.untrusted.npz import array_names, read_arrays
+from egosim_jax.runtime.command import ExitCode, run_with_exit_codes
 from egosim_jax.train.online.pool import CHUNK, latent_shapes, make_encode
 from egosim_jax.train.online.scenes import EndlessScenes, row_of
+from egosim_jax.types import InputError
 
 SCALE = "_scale"
 """Suffix of the name of an array's scale."""
@@ -112,37 +114,39 @@ def make_latents(
             yield made
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    """Parse the command line and make latents."""
-    parser = argparse.ArgumentParser(prog="python -m egosim_jax.train.online.latents")
-    parser.add_argument("--config", default="tabletop", help="name of the model")
-    parser.add_argument("--weights", type=Path, help="folder of the VAE; default: the package's")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the shards")
-    parser.add_argument("--first", type=int, required=True, help="first seed")
-    parser.add_argument("--stride", type=int, default=1, help="distance of two seeds")
-    parser.add_argument("--scenes", type=int, default=10**9, help="number of scenes")
-    parser.add_argument("--clips", type=int, default=2, help="clips of a scene")
-    parser.add_argument(
-        "--fused", type=float, default=0.0, help="fraction of scenes with fused states (Open3D)"
-    )
-    options = parser.parse_args(args)
-    weights = options.weights or configs.shipped_weights(options.config)
+def main(
+    *,
+    out: Path,
+    first: int,
+    config: str = "tabletop",
+    weights: Path | None = None,
+    stride: int = 1,
+    scenes: int = 10**9,
+    clips: int = 2,
+    fused: float = 0.0,
+) -> int:
+    """Make latents of scenes for an online training.
+
+    Args:
+        out: Folder of the shards.
+        first: First seed.
+        config: Name of the model.
+        weights: Folder of the VAE, by default the package's.
+        stride: Distance of two seeds.
+        scenes: Number of scenes.
+        clips: Clips of a scene.
+        fused: Fraction of scenes with fused states (Open3D).
+    """
+    weights = weights or configs.shipped_weights(config)
     if weights is None:
-        parser.error(f"{options.config} has no weights in the package: give some with --weights")
-    began = time.monotonic()
-    for made in make_latents(
-        configs.get(options.config),
-        weights,
-        options.out,
-        first=options.first,
-        stride=options.stride,
-        scenes=options.scenes,
-        clips=options.clips,
-        fused=options.fused,
-    ):
+        raise InputError(f"{config} has no weights in the package: give some. (--weights)")
+    model, began = configs.get(config), time.monotonic()
+    options = {"first": first, "stride": stride, "scenes": scenes, "clips": clips}
+    for made in make_latents(model, weights, out, fused=fused, **options):
         pace = (time.monotonic() - began) / made
         print(f"{made} clips, {pace:.2f} s each", file=sys.stderr, flush=True)
+    return ExitCode.DONE
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_with_exit_codes(lambda: tyro.cli(main)))

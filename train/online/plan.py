@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from egosim_jax import configs
 from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.configs.model import ModelConfig
 from egosim_jax.train.tasks.few_steps import FewSteps
@@ -17,13 +19,13 @@ from egosim_jax.types import InputError, check_counts
 class OnlineTraining:
     """Settings of an online training."""
 
-    model: ModelConfig
-    """Model to train."""
-    start: Path
-    """Folder of the weights to start from; a shallower denoiser is deepened."""
+    config: str = "tabletop"
+    """Name of the model to train."""
+    weights: Path | None = None
+    """Folder of the weights to start from, by default the package's."""
     out: Path
     """Folder of the run."""
-    minutes: float | None = None
+    minutes: float | None = 12.0
     """Duration, compilation included; None: by `updates`."""
     updates: int | None = None
     """Number of the denoiser's updates; the run ends at the first of both limits."""
@@ -76,14 +78,28 @@ class OnlineTraining:
         """Raise `InputError` without an end, and for counts below 1."""
         if self.minutes is None and self.updates is None:
             raise InputError("A training needs an end: give minutes or updates. (--minutes)")
+        _ = self.start
         counts = ("batch", "per_program", "decoder_batch", "first_clips", "clips", "frames")
         check_counts({name: getattr(self, name) for name in counts})
 
+    @cached_property
+    def model(self) -> ModelConfig:
+        """Config of the model, with the numerics of this training."""
+        import jax
+
+        model = configs.get(self.config)
+        dit: Any = replace(model.dit, remat="none")
+        if jax.default_backend() == "gpu":  # cuDNN's kernel has a backward pass, "auto" has none
+            dit = replace(dit, dtype="bfloat16", products=None, attention="cudnn")
+        return replace(model, dit=dit)
+
     @property
-    def layers(self) -> int:
-        """Number of the denoiser's blocks."""
-        dit: Any = self.model.dit
-        return dit.layers
+    def start(self) -> Path:
+        """Folder of the weights to start from. Raises `InputError` without any."""
+        start = self.weights or configs.shipped_weights(self.config)
+        if start is None:
+            raise InputError(f"{self.config} has no weights in the package: give some. (--weights)")
+        return start
 
     @property
     def denoising(self) -> FewSteps:

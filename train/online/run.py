@@ -2,8 +2,8 @@
 
 The learning rates follow the share of the run's time, or of its updates, that has passed: a linear
 warm-up of `WARMUP` updates, then a cosine to a hundredth. Latents made beforehand (`latents`) are
-read first, and as they arrive. Weights are written as parts of at most 16 MiB, at intervals and at
-the end, and so are checkpoints: the same command resumes an interrupted run. It waits for clips
+read first, and as they arrive. Weights and checkpoints are written at intervals and at the end: the
+same command resumes an interrupted run. It waits for clips
 again, because checkpoints have none.
 """
 
@@ -25,9 +25,9 @@ from flax import nnx
 
 from egosim_jax.configs.model import Networks
 from egosim_jax.data.records import stacked
-from egosim_jax.io import parts, weights
+from egosim_jax.io import weights
+from egosim_jax.io.atomic import atomic_folder
 from egosim_jax.io.checkpoint import Checkpoints
-from egosim_jax.train.deepen import deepen_weights
 from egosim_jax.train.metric_writers import JsonLines
 from egosim_jax.train.online.arrivals import Clips, start_workers
 from egosim_jax.train.online.latents import read_latents
@@ -61,11 +61,10 @@ class OnlineRun:
         self.plan, self.began = plan, time.monotonic()
         plan.out.mkdir(parents=True, exist_ok=True)
         model = plan.model
-        start = deepen_weights(plan.start, plan.layers, plan.out / "start")
         only = (*model.trained_networks, "vae")
         self.networks = nnx.eval_shape(lambda: Networks.build(model, only=only, rngs=nnx.Rngs(0)))
         for name in only:
-            weights.load(start / f"{name}.safetensors", getattr(self.networks, name))
+            weights.load(plan.start / f"{name}.safetensors", getattr(self.networks, name))
         vae: Any = self.networks.vae
         self.networks = Networks(
             dit=self.networks.dit, text=self.networks.text, image=self.networks.image
@@ -342,7 +341,7 @@ class OnlineRun:
         return totals
 
     def save(self) -> None:
-        """Write the averaged weights of all networks, as parts of at most 16 MiB, and a checkpoint.
+        """Write the averaged weights of all networks, and a checkpoint.
 
         The checkpoint is written in the background.
         """
@@ -353,10 +352,8 @@ class OnlineRun:
         trained = nnx.merge(self.graph, self.state.average)
         vae: Any = nnx.merge(self.vae_graph, self.decoder_state.average, self.frozen).vae
         networks = Networks(dit=trained.dit, text=trained.text, image=trained.image, vae=vae)
-        with TemporaryDirectory(dir=self.plan.out) as folder:
-            networks.save(Path(folder), dtype="float16")
-            files = sorted(Path(folder).glob("*.safetensors"))
-            parts.cut(files, self.plan.out / "weights")
+        with atomic_folder(self.plan.out / "weights") as folder:
+            networks.save(folder, dtype="float16")
 
     def _say(
         self,

@@ -4,22 +4,21 @@
 
 writes the clips of the scenes SEED, SEED + N, ... to the folder, each as one file that appears
 complete, and waits while the folder is full. A seed decides everything: the kind of hands, and
-whether the scene is a script, an attempt (`worlds/tabletop/attempts.py`) or idle
-(`worlds/tabletop/idle.py`).
+whether the scene is a script, or an attempt, an encounter or idle (modules of `worlds/tabletop`).
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tyro
 
 from egosim_jax import configs
 from egosim_jax.configs.model import ModelConfig
@@ -29,7 +28,9 @@ from egosim_jax.state.fuse import fuse
 from egosim_jax.types import Clip, SceneState, Triplet
 from egosim_jax.worlds.tabletop import TabletopClip, make_scripts, make_sequence, state_after
 from egosim_jax.worlds.tabletop.attempts import make_attempts
-from egosim_jax.worlds.tabletop.clips import to_action, to_ground_truth, to_triplet
+from egosim_jax.worlds.tabletop.clips import observation_of, to_action, to_triplet
+from egosim_jax.worlds.tabletop.dataset import conditions_of
+from egosim_jax.worlds.tabletop.encounters import make_encounters
 from egosim_jax.worlds.tabletop.idle import make_idle
 
 HELD_OUT = "held"
@@ -52,6 +53,8 @@ class EndlessScenes:
     """Fraction of scenes with a gripper."""
     attempts: float = 0.25
     """Fraction of scenes in which a grasp may fail and the head turns."""
+    encounters: float = 0.3
+    """Fraction of scenes in which hands push, two hands act, bodies carry others or grasps slip."""
     idle: float = 0.12
     """Fraction of scenes whose hands rest, are absent or wander."""
     wrong_prompts: float = 0.04
@@ -68,11 +71,14 @@ class EndlessScenes:
         """Yield the clips of a scene."""
         rng = np.random.default_rng([seed, 11])
         kind = "robot" if rng.random() < self.robots else "human"
-        choice = rng.random()
-        if choice < self.idle:
-            make = make_idle
-        else:
-            make = make_attempts if choice < self.idle + self.attempts else make_sequence
+        shares = {
+            make_idle: self.idle,
+            make_attempts: self.attempts,
+            make_encounters: self.encounters,
+        }
+        borders = np.cumsum(list(shares.values()))
+        number = int(np.searchsorted(borders, rng.random(), side="right"))
+        make = [*shares, make_sequence][number]
         for clip in make(
             seed,
             spec=self.model.video,
@@ -88,14 +94,17 @@ class EndlessScenes:
     def triplets(self, seed: int) -> Iterator[Triplet]:
         """Yield the clips of a scene as triplets, each rendered from the state before it."""
         fused = np.random.default_rng([seed, 12]).random() < self.fused
-        state = None
+        prior, hands = conditions_of(self.model)
+        before, state = None, None
         for clip in self.clips_of(seed):
-            yield to_triplet(clip, state, point_px=self.model.point_px)
-            state = state or clip.state
-            if fused:
-                state = fused_after(clip, state, fps=self.model.video.fps)
-            else:
-                state = state_after(clip, state)
+            if before is not None:
+                state = state or before.state
+                if fused:
+                    state = fused_after(before, state, fps=self.model.video.fps)
+                else:
+                    state = state_after(before, state)
+            yield to_triplet(clip, state, prior=prior, hands=hands, point_px=self.model.point_px)
+            before = clip
 
 
 def fused_after(clip: TabletopClip, state: SceneState, *, fps: int) -> SceneState:
@@ -115,7 +124,7 @@ def fused_after(clip: TabletopClip, state: SceneState, *, fps: int) -> SceneStat
         joints_m=clip.joints_m[some],
         world_from_body={name: path[some] for name, path in clip.world_from_body.items()},
     )
-    perceive = OracleConfig().build({state.step: to_ground_truth(clip)})
+    perceive = OracleConfig().build({state.step: observation_of(clip)})
     perceived = perceive(Clip(frames=clip.frames, fps=fps), to_action(clip), state)
     return fuse(state, perceived)
 
@@ -167,28 +176,23 @@ def make(scenes: EndlessScenes, queue: Path, *, first: int, stride: int, held_ou
         seed += stride
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    """Parse the command line and make scenes."""
-    parser = argparse.ArgumentParser(prog="python -m egosim_jax.train.online.scenes")
-    parser.add_argument("--config", default="tabletop", help="name of the model")
-    parser.add_argument("--queue", type=Path, required=True, help="folder of the clips")
-    parser.add_argument("--first", type=int, required=True, help="first seed")
-    parser.add_argument("--stride", type=int, default=1, help="distance of two seeds")
-    parser.add_argument("--held-out", type=int, default=0, help="scenes of validation, made first")
-    options = parser.parse_args(args)
-    scenes = EndlessScenes(model=configs.get(options.config))
+def main(*, queue: Path, first: int, config: str, stride: int, held_out: int) -> None:
+    """Make the scenes of one process of a training.
+
+    Args:
+        queue: Folder of the clips.
+        first: First seed.
+        config: Name of the model.
+        stride: Distance of two seeds.
+        held_out: Scenes of validation, made first.
+    """
+    scenes = EndlessScenes(model=configs.get(config))
     os.nice(10)  # the training process comes first
     cores = sorted(os.sched_getaffinity(0))
-    if options.stride + 2 <= len(cores):  # Embree would start more threads than one each
-        os.sched_setaffinity(0, {cores[2 + options.first % options.stride]})
-    make(
-        scenes,
-        options.queue,
-        first=options.first,
-        stride=options.stride,
-        held_out=options.held_out,
-    )
+    if stride + 2 <= len(cores):  # Embree would start more threads than one each
+        os.sched_setaffinity(0, {cores[2 + first % stride]})
+    make(scenes, queue, first=first, stride=stride, held_out=held_out)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -89,8 +89,7 @@ class Updater:
         valid = jnp.isfinite(value) & jnp.isfinite(optax.tree.norm(gradients))
         updates, opt_state = self.optimizer.update(gradients, state.opt_state, state.params)
         params: Any = optax.apply_updates(state.params, jax.tree.map(lambda x: rate * x, updates))
-        # By the clock a run may end at any step, so the average is warmed up.
-        decay = self.config.ema_decay_at(state.step, steps=1)
+        decay = self.config.ema_decay_at(state.step)
         average: Any = optax.incremental_update(params, state.average, 1 - decay)
         changed = OnlineState(
             step=state.step + 1,

@@ -81,8 +81,17 @@ class FewSteps(Denoising):
         return errors.mean(), metrics
 
     def bounds(self, batch: int, steps: int) -> list[int]:
-        """Return the first sample of each step in a batch, and the number of samples."""
-        others = round(self.others * batch)
+        """Return the first sample of each step in a batch, and the number of samples.
+
+        Raises `InputError` if there are fewer samples than steps: the objective would lack a step.
+        """
+        if batch < steps:
+            raise InputError(
+                f"Parts of a batch must have at least one sample for each of the sampler's {steps} "
+                f"steps, not {batch}: raise --training.batch-size, or lower "
+                "--training.grad-accum-steps. (batch_size)"
+            )
+        others = min(round(self.others * batch), batch - steps)
         return [others + round(n * (batch - others) / steps) for n in range(steps + 1)]
 
     def sampled(

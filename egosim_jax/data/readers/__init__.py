@@ -7,7 +7,8 @@ Each module documents its format's cameras, units, joint order and pixel centers
 
 - Reader, Entry: the protocol of a reader, and a recording that it found
 - make_id, natural_order: id from path parts, sort key of numbered names
-- inside, find_files, require: checks of paths, files and optional libraries
+- inside, find_files, numbered, require: paths, files and optional libraries
+- make_rate, check_one_camera: a frame rate, and one focal length, for all frames
 """
 
 from __future__ import annotations
@@ -15,11 +16,16 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
 
 from egosim_jax.data.recording import Recording
 from egosim_jax.io.bounded import quote
+from egosim_jax.runtime.registry import Registry
 from egosim_jax.types import InputError
 
 NOTE = "used"
@@ -52,6 +58,10 @@ class Reader(Protocol):
         ...
 
 
+READERS: Registry[type[Reader]] = Registry("reader", "--reader", "egosim_jax.readers")
+"""Readers of other packages; our readers are subcommands of `egosim data import`."""
+
+
 def make_id(parts: Sequence[str]) -> str:
     """Return a valid id made of names, joined by underscores."""
     return re.sub(r"[^A-Za-z0-9._-]+", "_", "_".join(parts)).lstrip(".")[-200:]
@@ -65,6 +75,33 @@ def inside(root: Path, name: object, *, what: str) -> Path:
             f"{what} is {quote(name)}: it must be a path inside the dataset's folder, without '..'."
         )
     return root / path
+
+
+def numbered(paths: Iterable[Path]) -> dict[int, Path]:
+    """Return the files whose names end with a number after an underscore, or are one."""
+    ends = {path.stem.rpartition("_")[2]: path for path in paths}
+    return {int(digits): path for digits, path in ends.items() if digits.isdecimal()}
+
+
+def make_rate(fps: Any, *, what: str = "--fps") -> Fraction:
+    """Return a given frame rate as a fraction. Raises `InputError` if it is out of range."""
+    if isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps <= 1000:
+        raise InputError(f"{what} is {quote(fps)}: it must be above 0 and at most 1000.")
+    return Fraction(fps).limit_denominator(1001) or Fraction(fps)
+
+
+def check_one_camera(focal_px: Float[np.ndarray, " f"], name: str, *, most: float) -> float:
+    """Return the relative change of the focal lengths of frames.
+
+    Raises `InputError` above `most`, because a recording has one camera.
+    """
+    change = float(np.ptp(focal_px) / max(float(np.median(focal_px)), 1e-9))
+    if change > most:
+        raise InputError(
+            f"{name}: the focal length changes by {change:.1%}, more than {most:.0%}: one camera "
+            "is needed for all frames. Lock the focus, or split the capture."
+        )
+    return change
 
 
 def require(module: str) -> None:

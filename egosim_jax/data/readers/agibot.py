@@ -38,8 +38,8 @@ import numpy as np
 import tyro
 from jaxtyping import Float, Int
 
-from egosim_jax.data.pairing import pair_rows
-from egosim_jax.data.readers import Entry, find_files, make_id, require
+from egosim_jax.data.pairing import by_frame, pair_rows
+from egosim_jax.data.readers import Entry, find_files, make_id, numbered, require
 from egosim_jax.data.readers.hands import clean_joints
 from egosim_jax.data.readers.lenses import Lens, Remap
 from egosim_jax.data.readers.rotations import from_quaternions
@@ -47,9 +47,9 @@ from egosim_jax.data.recorded_files import DepthFiles
 from egosim_jax.data.recording import Recording
 from egosim_jax.geometry import invert, project, transform
 from egosim_jax.io.bounded import quote, quote_path, read_json
-from egosim_jax.io.segments import probe_long_video, read_segment
 from egosim_jax.io.untrusted.hdf5 import read_hdf5
-from egosim_jax.io.video import VideoInfo, write_frames
+from egosim_jax.io.video import VideoInfo, probe_video, read_video
+from egosim_jax.io.writing import write_frames
 from egosim_jax.types import Cameras, InputError
 
 logger = logging.getLogger(__name__)
@@ -139,14 +139,13 @@ class AgiBot:
                 )
 
     def _read(self, files: _Files, part: _Part, folder: Path) -> Recording:
-        info = probe_long_video(files.video)
+        info = probe_video(files.video)
         info.check_square(quote_path(files.video))
         lens = _read_lens(files.camera / "head_intrinsic_params.json", info)
         matrices = _read_extrinsics(files.camera / "head_extrinsic_params_aligned.json")
         joints, tools, notes = _read_grippers(files.states, self.opening)
-        counts = {"poses": len(matrices), "states": len(joints)}
-        what = " and ".join(f"{name} {count}" for name, count in counts.items())
-        rows = pair_rows(files.video, info, min(counts.values()), what=f"rows ({what})")
+        tables = sorted([(len(matrices), "camera poses"), (len(joints), "states")])
+        rows, _ = (pair_rows(files.video, info, count, what=what) for count, what in tables)
         span = _span(part, rows, files.video)
         rows = rows[span]
         joints, matrices = joints[rows], matrices[rows]
@@ -173,9 +172,9 @@ class AgiBot:
             world_from_camera=poses,
             intrinsics_px=cameras.intrinsics_px,
             metric=True,
-            joints_m=None if np.isnan(joints).all() else joints,
+            joints_m=None if joints is None or np.isnan(joints).all() else joints,
             kind="robot",
-            depth=_find_depth(files.depth, rows) if remap is None else None,
+            depth=_find_depth(files.depth, rows, files.video, info) if remap is None else None,
             caption=part.caption,
             provenance={
                 **decision,
@@ -369,18 +368,18 @@ def _meaning(command: np.ndarray | None, opening: Float[np.ndarray, "f 2"], path
     return "closed_mm" if agreement > 0 else "open_mm"
 
 
-def _find_depth(folder: Path, rows: np.ndarray) -> DepthFiles | None:
-    found = {path.stem.rpartition("_")[2]: path for path in folder.glob("head_depth_*.png")}
-    numbered = {int(digits): path for digits, path in found.items() if digits.isdecimal()}
-    paths = tuple(numbered.get(frame) for frame in rows.tolist())
+def _find_depth(folder: Path, rows: np.ndarray, video: Path, info: VideoInfo) -> DepthFiles | None:
+    maps = numbered(folder.glob("head_depth_*.png"))
+    maps = by_frame(maps, video, info, what="depth maps")
+    paths = tuple(maps.get(frame) for frame in rows.tolist())
     return DepthFiles(paths=paths, unit_m=0.001) if any(paths) else None
 
 
 def _remap_video(path: Path, span: slice, info: VideoInfo, remap: Remap, folder: Path) -> Path:
     def frames() -> Iterator[np.ndarray]:
         for start in range(span.start, span.stop, CHUNK):
-            count = min(CHUNK, span.stop - start)
-            yield from remap.apply(read_segment(path, start=start, count=count).frames)
+            stop = min(start + CHUNK, span.stop)
+            yield from remap.apply(read_video(path, start=start, stop=stop, whole=True).frames)
 
     write_frames(folder / "video.mp4", frames(), info.fps)
     return folder / "video.mp4"

@@ -3,15 +3,15 @@
 A folder with a sparse model (itself, or in sparse/0 or sparse/) and the images in images/. The
 images in order of their names are the frames of a video, at a rate that the user gives. The
 longest run of registered images without gaps is the recording. One camera must have taken all
-images; distorted images are remapped, and so are the pixels that observe points. The unit is
-arbitrary, so that `metric` is False. Conventions: `io/untrusted/colmap.py`.
+images, or cameras that are equal within 1 %, whose median is used. Distorted images are remapped,
+and so are the pixels that observe points. The unit is arbitrary, so that `metric` is False.
+Conventions: `io/untrusted/colmap.py`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from fractions import Fraction
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -19,7 +19,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 import tyro
 
-from egosim_jax.data.readers import Entry, inside, make_id, natural_order, require
+from egosim_jax.data.readers import Entry, inside, make_id, make_rate, natural_order, require
 from egosim_jax.data.readers.images import (
     MAX_IMAGES,
     ImageVideo,
@@ -28,7 +28,7 @@ from egosim_jax.data.readers.images import (
     read_posed,
     write_images,
 )
-from egosim_jax.data.readers.lenses import Lens
+from egosim_jax.data.readers.lenses import MAX_SPREAD, Lens
 from egosim_jax.data.recording import Recording
 from egosim_jax.data.scene_points import ScenePoints
 from egosim_jax.geometry import invert
@@ -87,20 +87,14 @@ class Colmap:
             if path.suffix.lower() in IMAGES
         ][:MAX_IMAGES]
         run = longest_run(names, by_name.__contains__)
-        images = [by_name[name] for name in names[run]]
+        images = [by_name[names[index]] for index in run]
         if not images:
             raise InputError(
                 f"{quote_path(root)} has none of the model's {len(by_name)} images: their names "
                 "are relative to it, and in text files have no spaces. (--images)"
             )
-        cameras = {image.camera_id for image in images}
-        if len(cameras) > 1:
-            raise InputError(
-                f"The images are of {len(cameras)} cameras: one camera must have taken all. "
-                "Reconstruct with a single camera (--ImageReader.single_camera 1)."
-            )
         paths = [inside(root, image.name, what="an image of the model") for image in images]
-        lens = make_lens(model.cameras[cameras.pop()])
+        lens = one_lens([model.cameras[image.camera_id] for image in images])
         video = write_images(folder, (read_posed(path, lens) for path in paths), lens, fps)
         return Recording(
             recording_id=make_id([self.source.resolve().name]),
@@ -127,11 +121,18 @@ class Colmap:
         return found
 
 
-def make_rate(fps: float) -> Fraction:
-    """Return a given frame rate as a fraction. Raises `InputError` if it is out of range."""
-    if not 0 < fps <= 1000:
-        raise InputError(f"--fps is {fps}: it must be above 0 and at most 1000.")
-    return Fraction(fps).limit_denominator(1001)
+def one_lens(cameras: Sequence[Camera]) -> Lens:
+    """Return the median lens of all images. Raises `InputError` if their cameras differ."""
+    first, table = cameras[0], [camera.parameters for camera in cameras]
+    kinds = {(camera.model, camera.height, camera.width) for camera in cameras}
+    median = np.median(table, axis=0) if len(kinds) == 1 else np.zeros(0)
+    if len(kinds) > 1 or (np.ptp(table, axis=0) > MAX_SPREAD * np.maximum(abs(median), 1)).any():
+        raise InputError(
+            f"The images are of {len(set(cameras))} different cameras, by more than "
+            f"{MAX_SPREAD:.0%} of a parameter: one camera must have taken all. Reconstruct with a "
+            "single camera (--ImageReader.single_camera 1), or split the images."
+        )
+    return make_lens(replace(first, parameters=tuple(median.tolist())))
 
 
 def make_lens(camera: Camera) -> Lens:

@@ -3,7 +3,7 @@
     <split>/<task>/<id>.hdf5 and .mp4, 1920x1080, 30 frames per second
         camera/intrinsic          3 3, pixels
         transforms/<name>         f 4 4, `name` to world, meters: camera and 68 joints
-        confidences/<joint>       f, 0 to 1; the group may be absent
+        confidences/<joint>       f, 0 to 1; 1 where it is absent
         attributes                llm_description, llm_description2, which_llm_description,
                                   llm_type, llm_objects
 
@@ -11,12 +11,14 @@ EgoSim's cuts of such files, `<id>_<start>_<end>.hdf5` with 121 poses at 16 fram
 cameras but no hands. The camera's axes are OpenCV's; the world is ARKit's, y up, with an arbitrary
 origin. The dataset has 25 joints per hand. Our 21 omit the four metacarpals: they are the wrist
 (`Hand`), the thumb from Knuckle to Tip, and Knuckle, IntermediateBase, IntermediateTip and Tip of
-index, middle, ring and little finger. Pixel coordinates start at the corner of the image (its
-center is at 960, 540), so half a pixel is subtracted. Followed: Apple's loader as of 2025.
+index, middle, ring and little finger. A hand without one of them is unknown.
+Pixel coordinates start at the corner of the image (its center is at 960, 540), so half a pixel is
+subtracted. Followed: Apple's loader as of 2025.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -32,10 +34,12 @@ from egosim_jax.data.pairing import pair_rows
 from egosim_jax.data.readers import Entry, find_files, make_id, require
 from egosim_jax.data.readers.hands import clean_joints
 from egosim_jax.data.recording import Recording
-from egosim_jax.io.bounded import quote, quote_path
-from egosim_jax.io.segments import probe_long_video
+from egosim_jax.io.bounded import listing, quote_path
 from egosim_jax.io.untrusted.hdf5 import read_hdf5
+from egosim_jax.io.video import probe_video
 from egosim_jax.types import Cameras, InputError
+
+logger = logging.getLogger(__name__)
 
 _SEGMENTS = ("Knuckle", "IntermediateBase", "IntermediateTip", "Tip")
 _FINGERS = ("Thumb", "IndexFinger", "MiddleFinger", "RingFinger", "LittleFinger")
@@ -70,36 +74,38 @@ class EgoDex:
 
     def _read(self, path: Path, folder: Path) -> Recording:
         video = path.with_suffix(".mp4")
-        info = probe_long_video(video)
+        info = probe_video(video)
         names = [side + name for side in SIDES for name in JOINT_NAMES]
         file = read_hdf5(
             path,
-            {"transforms/camera": (None, 4, 4), "camera/intrinsic": (3, 3)},
+            {"transforms/camera": (None, 4, 4)},
             optional={
+                "camera/intrinsic": (3, 3),
                 **{f"transforms/{name}": (None, 4, 4) for name in names},
                 **{f"confidences/{name}": (None,) for name in names},
             },
             texts=TEXTS,
         )
-        poses, intrinsics = (file.arrays[n] for n in ("transforms/camera", "camera/intrinsic"))
-        lengths = {len(a) for name, a in file.arrays.items() if name != "camera/intrinsic"}
-        if lengths != {len(poses)}:
-            raise InputError(
-                f"{quote_path(path)} has {len(poses)} camera poses, joints or confidences of "
-                f"{quote(str(sorted(lengths)))} frames: all must agree. Get the file again."
-            )
+        poses, intrinsics = file.arrays["transforms/camera"], file.arrays.get("camera/intrinsic")
         rows = pair_rows(video, info, len(poses), what="camera poses")
-        joints = self._joints(file.arrays, names, path)
+        intrinsics = _fit_intrinsics(intrinsics, info.height, info.width)
+        joints, unknown = self._joints(file.arrays, names)
+        if intrinsics is None:
+            unknown = ["camera/intrinsic", *unknown]
+        if unknown:
+            logger.warning(
+                "%s: %s: missing, empty or of another length; this part stays unknown",
+                quote_path(path), listing(unknown),
+            )  # fmt: skip
         caption, objects = _texts(file.texts)
-        cameras = Cameras(
-            world_from_camera=poses[rows],
-            intrinsics_px=_fit_intrinsics(intrinsics, info.height, info.width),
+        poses, joints = poses[rows], None if joints is None else joints[rows]
+        cameras = None if intrinsics is None else Cameras(
+            world_from_camera=poses,
+            intrinsics_px=intrinsics,
             height=info.height,
             width=info.width,
-        )
-        counts: dict[str, str] = {}
-        if joints is not None:
-            joints, counts = clean_joints(joints[rows], cameras)
+        )  # fmt: skip
+        joints, notes = clean_joints(joints, cameras)
         return Recording(
             recording_id=make_id([path.stem]),
             video=video,
@@ -107,42 +113,43 @@ class EgoDex:
             fps=info.fps,
             height=info.height,
             width=info.width,
-            world_from_camera=cameras.world_from_camera,
-            intrinsics_px=cameras.intrinsics_px,
+            world_from_camera=poses,
+            intrinsics_px=intrinsics,
             metric=True,
             joints_m=joints,
             caption=caption or None,
             names=objects,
-            provenance=counts,
+            provenance=notes,
         )
 
     def _joints(
-        self, arrays: Mapping[str, np.ndarray], names: list[str], path: Path
-    ) -> Float[np.ndarray, "f 2 21 3"] | None:
-        """Return the joints of both hands; None if the file has none."""
-        absent = [name for name in names if f"transforms/{name}" not in arrays]
-        if len(absent) == len(names):
-            return None
-        if absent:
-            raise InputError(
-                f"{quote_path(path)}: transforms/{absent[0]} is missing; expected all joints of "
-                "both hands, or none."
-            )
-        joints = np.stack([arrays[f"transforms/{name}"][:, :3, 3] for name in names], axis=1)
-        joints = rearrange(joints, "f (n j) c -> f n j c", n=2)
-        certain = [arrays.get(f"confidences/{name}", np.ones(len(joints))) for name in names]
-        confidence = rearrange(np.stack(certain), "(n j) f -> f n j", n=2)
+        self, arrays: Mapping[str, np.ndarray], names: list[str]
+    ) -> tuple[Float[np.ndarray, "f 2 21 3"] | None, list[str]]:
+        """Return the joints of both hands, None if the file has none, and what it lacks of them."""
+        if not any(f"transforms/{name}" in arrays for name in names):
+            return None, []
+        frames = len(arrays["transforms/camera"])
+        given = {name: array for name, array in arrays.items() if len(array) == frames}
+        unknown = [path for name in names if (path := f"transforms/{name}") not in given]
+        nowhere, certain = np.full((frames, 4, 4), np.nan), np.ones(frames)
+        moved = [given.get(f"transforms/{name}", nowhere)[:, :3, 3] for name in names]
+        joints = rearrange(np.stack(moved, axis=1), "f (n j) c -> f n j c", n=2)
+        confidences = [given.get(f"confidences/{name}", certain) for name in names]
+        confidence = rearrange(np.stack(confidences), "(n j) f -> f n j", n=2)
         joints[np.median(confidence, axis=2) < self.min_confidence] = np.nan
-        return joints
+        return joints, unknown
 
 
 def _fit_intrinsics(
-    intrinsics: Float[np.ndarray, "3 3"], height: int, width: int
-) -> Float[np.ndarray, "3 3"]:
+    intrinsics: Float[np.ndarray, "3 3"] | None, height: int, width: int
+) -> Float[np.ndarray, "3 3"] | None:
     """Return intrinsics with pixel centers at integers, for a video that may have been resized.
 
-    The principal point is the image center, so it gives the size of the original image.
+    Zeros or NaN are unknown intrinsics. The principal point is the image
+    center, so it gives the size of the original image.
     """
+    if intrinsics is None or not np.isfinite(intrinsics).all() or not intrinsics.any():
+        return None
     columns, rows = 2 * intrinsics[0, 2], 2 * intrinsics[1, 2]
     if not (columns > 0 and rows > 0 and abs(columns * height - rows * width) < 2 * columns):
         raise InputError(

@@ -25,7 +25,7 @@ import numpy as np
 import tyro
 
 from egosim_jax.data.pairing import pair_rows
-from egosim_jax.data.readers import Entry, make_id, natural_order
+from egosim_jax.data.readers import Entry, check_one_camera, make_id, natural_order, numbered
 from egosim_jax.data.readers.egovid import read_matrices
 from egosim_jax.data.readers.hamer import read_hamer
 from egosim_jax.data.readers.hands import clean_joints
@@ -33,7 +33,7 @@ from egosim_jax.data.recorded_files import DepthFiles
 from egosim_jax.data.recording import Recording
 from egosim_jax.geometry import invert
 from egosim_jax.io.bounded import quote_path, read_bytes
-from egosim_jax.io.segments import probe_long_video
+from egosim_jax.io.video import probe_video
 from egosim_jax.types import Cameras, InputError
 
 logger = logging.getLogger(__name__)
@@ -73,32 +73,31 @@ def _read(clip: Path, folder: Path) -> Recording:
     video = next((clip / name for name in VIDEOS if (clip / name).exists()), None)
     if video is None:
         raise InputError(f"{quote_path(clip)} has none of {', '.join(VIDEOS)}.")
-    info = probe_long_video(video)
+    info = probe_video(video)
     info.check_square(quote_path(video))
     poses_folder = _find_poses(clip / "_proc")
     paths, found = _numbered(poses_folder)
     rows = pair_rows(video, info, found, what="extrinsics")
     rows = rows[rows < len(paths)]
     poses = invert(np.stack([read_matrices(path, (4, 4)) for path in paths]))
-    cameras = [
-        read_matrices(path.with_name(path.name.replace("extrinsics", "intrinsics")), (3, 3))
-        for path in paths
-    ]
-    intrinsics = np.median(cameras, axis=0)
-    drift = float(np.ptp(np.stack(cameras)[:, 0, 0]) / max(intrinsics[0, 0], 1e-9))
-    if drift > MAX_DRIFT:
-        raise InputError(
-            f"{quote_path(poses_folder)}: the focal length changes by {drift:.1%}, more than "
-            f"{MAX_DRIFT:.0%}: one camera is needed for all frames."
-        )
-    seen = Cameras(world_from_camera=poses, intrinsics_px=intrinsics, height=info.height,
-                   width=info.width)  # fmt: skip
-    paired = replace(seen, world_from_camera=poses[rows])
-    joints, counts = None, dict[str, str]()
+    lenses = [path.with_name(path.name.replace("extrinsics", "intrinsics")) for path in paths]
+    cameras = [read_matrices(path, (3, 3)) for path in lenses if path.exists()]
+    joints, counts, intrinsics = None, dict[str, str](), None
+    if cameras:
+        intrinsics = np.median(cameras, axis=0)
+        focal_px = np.stack(cameras)[:, 0, 0]
+        drift = check_one_camera(focal_px, quote_path(poses_folder), most=MAX_DRIFT)
+        counts["focal_drift"] = f"{drift:.4f}"
+    else:
+        logger.warning("%s: intrinsics and hands stay unknown", quote_path(lenses[0]))
     hands = sorted((clip / "_proc" / "mano_full").rglob("*.json"))
-    if hands:
+    if hands and intrinsics is not None:
+        seen = Cameras(world_from_camera=poses, intrinsics_px=intrinsics, height=info.height,
+                       width=info.width)  # fmt: skip
+        paired = replace(seen, world_from_camera=poses[rows])
         limit = max(len(paths), len(info.timeline.listed_s))
-        joints, counts = clean_joints(read_hamer(hands[0], seen, limit)[rows], paired)
+        joints, odd = clean_joints(read_hamer(hands[0], seen, limit)[rows], paired)
+        counts |= odd
     depth = poses_folder / "depth_000000.npy"
     files = (depth if depth.exists() else None, *[None] * (len(rows) - 1))
     caption = clip / "caption.txt"
@@ -112,7 +111,7 @@ def _read(clip: Path, folder: Path) -> Recording:
         fps=info.fps,
         height=info.height,
         width=info.width,
-        world_from_camera=paired.world_from_camera,
+        world_from_camera=poses[rows],
         intrinsics_px=intrinsics,
         metric=True,
         joints_m=joints,
@@ -121,7 +120,6 @@ def _read(clip: Path, folder: Path) -> Recording:
         provenance={
             "poses": str(poses_folder.relative_to(clip)),
             "scale": "estimated by Depth Anything 3",
-            "focal_drift": f"{drift:.4f}",
             **counts,
         },
     )
@@ -129,20 +127,19 @@ def _read(clip: Path, folder: Path) -> Recording:
 
 def _numbered(folder: Path) -> tuple[list[Path], int]:
     """Return the extrinsics of the frames from 0 to the first gap, and the number of all."""
-    digits = {path.stem.rpartition("_")[2]: path for path in folder.glob("extrinsics_*.npy")}
-    found = {int(text): path for text, path in digits.items() if text.isdecimal()}
-    first = next(number for number in range(len(found) + 1) if number not in found)
+    files = numbered(folder.glob("extrinsics_*.npy"))
+    first = next(number for number in range(len(files) + 1) if number not in files)
     if not first:
         raise InputError(
             f"{quote_path(folder)} has no extrinsics_000000.npy: frames are numbered from 0. Run "
             "DA3 on the whole video."
         )
-    if first < len(found):
+    if first < len(files):
         logger.warning(
             "%s has %d extrinsics, but none of frame %d: only the frames before it are used",
-            quote_path(folder), len(found), first,
+            quote_path(folder), len(files), first,
         )  # fmt: skip
-    return [found[number] for number in range(first)], len(found)
+    return [files[number] for number in range(first)], len(files)
 
 
 def _find_poses(folder: Path) -> Path:

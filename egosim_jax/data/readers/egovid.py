@@ -6,11 +6,14 @@
                             (exclusive)
 
 The dataset documents neither the direction of the poses (camera to world or the reverse) nor the
-pixel centers. The direction is decided from the video by epipolar geometry (`pose_reading`) and
-recorded; poses stay unknown if the video does not decide. Pixel centers are assumed at integers.
-Of a clip with more frames than poses, the frames with poses are used. The fused poses are structure
-from motion scaled by an accelerometer. That scale is not trusted, so `metric` is False. The dataset
-has no hands. Followed: its README of 2025.
+pixel centers. The direction is decided from the video and recorded: tracks of points satisfy the
+epipolar constraint of the right direction only. The evidence is the median Sampson distance in
+pixels (Hartley and Zisserman, Multiple View Geometry, 11.4.3). Poses stay unknown if the video does
+not decide. Pixel centers are assumed at integers.
+Of a clip with more frames than poses, the frames with poses are used, unless poses at another rate
+fit the video better. Poses without intrinsics stay unknown. The fused poses are structure from
+motion scaled by an accelerometer. That scale is not trusted, so `metric` is False. The dataset has
+no hands. Followed: its README of 2025.
 """
 
 from __future__ import annotations
@@ -27,16 +30,15 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 import tyro
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
-from egosim_jax.data.pairing import check_lengths, pair_rows
+from egosim_jax.data.pairing import pair_rows
 from egosim_jax.data.readers import Entry, find_files, make_id
-from egosim_jax.data.readers.pose_reading import read_poses
 from egosim_jax.data.recording import Recording
+from egosim_jax.geometry import invert
 from egosim_jax.io.bounded import open_regular, quote_path, quote_text, read_bytes
-from egosim_jax.io.segments import probe_long_video, read_segment
 from egosim_jax.io.untrusted.npz import read_npy
-from egosim_jax.io.video import VideoInfo
+from egosim_jax.io.video import VideoInfo, probe_video, read_video
 from egosim_jax.types import InputError
 
 logger = logging.getLogger(__name__)
@@ -49,6 +51,18 @@ MAX_NPY_BYTES = 1 << 24
 """Maximum size of a file of poses in bytes."""
 MAX_LINE = 1 << 20
 """Maximum length of a line in a table, in characters."""
+PAIRS = 6
+"""Number of frame pairs to compare."""
+GAP = 8
+"""Distance between the frames of a pair."""
+MIN_TRACKS = 20
+"""Minimum number of tracks for a pair to count."""
+MAX_ERROR_PX = 3.0
+"""Maximum median Sampson distance of an accepted reading, in pixels."""
+MIN_RATIO = 1.5
+"""Minimum ratio between the two readings' distances for a decision."""
+RATE = "other_rate"
+"""Reading of poses that are as many for the whole clip as its frames at another rate."""
 _ID = re.compile(r"([A-Za-z0-9-]+)_(\d{1,9})_(\d{1,9})")
 
 
@@ -87,7 +101,7 @@ def _read(
     root: Path, video: Path, video_id: str, row: Mapping[str, str], folder: Path
 ) -> Recording:
     uuid, start, stop = _split(video_id)
-    info = probe_long_video(video)
+    info = probe_video(video)
     if video.stem == uuid and video.stem != video_id:
         frames = max(0, min(stop, info.frames) - start)
         if frames < stop - start:
@@ -101,8 +115,8 @@ def _read(
     poses = intrinsics = None
     path = root / "poses" / video_id
     if path.is_dir() and re.fullmatch(_ID, video_id):
-        rows, poses, intrinsics, notes = _read_cameras(path, video, info, start, frames)
-        frames = frames if rows is None else len(rows)
+        poses, intrinsics, notes = _read_cameras(path, video, info, start, frames)
+        frames = frames if poses is None else len(poses)
     caption = row.get("llava_cap", "").strip() or row.get("name", "").strip()
     nouns = [noun.strip() for noun in row.get("noun_cls", "").split(",")]
     return Recording(
@@ -123,30 +137,34 @@ def _read(
 
 def _read_cameras(
     folder: Path, video: Path, info: VideoInfo, start: int, frames: int
-) -> tuple[np.ndarray | None, np.ndarray | None, Float[np.ndarray, "3 3"], dict[str, str]]:
-    """Return the row of each frame and its pose, both None if unknown, intrinsics and notes."""
+) -> tuple[np.ndarray | None, np.ndarray | None, dict[str, str]]:
+    """Return the poses of the first frames and the intrinsics, None if unknown, and notes."""
     path = next((folder / name for name in POSES if (folder / name).exists()), None)
     if path is None:
         raise InputError(f"{quote_path(folder)} has none of {', '.join(POSES)}.")
-    intrinsics = read_matrices(folder / "intri.npy", (3, 3))
-    intrinsics[:2] *= info.height / ROWS
     matrices = read_matrices(path, (None, 4, 4))
+    rows, other = np.arange(min(frames, len(matrices))), None
     try:
-        if start == 0 and frames == info.frames:
-            rows = pair_rows(video, info, len(matrices), what="poses")
-        else:
-            fps = float(info.fps)
-            rows = np.arange(check_lengths(video, frames, len(matrices), fps=fps, what="poses"))
+        intrinsics = read_matrices(folder / "intri.npy", (3, 3))
     except InputError as error:
-        logger.warning("%s Its poses stay unknown.", error)
-        why = f"unknown: {len(matrices)} poses for {frames} frames"
-        return None, None, intrinsics, {"poses": why}
-    decoded = read_segment(video, start=start, count=len(rows), each=_halve).frames
+        logger.warning("%s The poses stay unknown.", error)
+        return None, None, {"poses": "unknown: no intrinsics"}
+    intrinsics[:2] *= info.height / ROWS
+    try:
+        rows = pair_rows(video, info, len(matrices), what="poses", frames=frames)
+    except InputError:
+        other = matrices[rows * len(matrices) // frames]
+    fewer = f"{len(matrices)} poses for {frames} frames"
     scale = np.diag([0.5, 0.5, 1.0])
-    poses, evidence = read_poses(decoded, matrices[rows], scale @ intrinsics)
+    poses, evidence = None, {"poses": "unknown: none"}
+    if len(rows):
+        decoded = read_video(video, start=start, stop=start + len(rows), whole=True, each=_halve)
+        poses, evidence = _direct(decoded.frames, matrices[rows], other, scale @ intrinsics)
     if poses is None:
-        rows = None
-    return rows, poses, intrinsics, {**evidence, "poses_file": path.name}
+        logger.warning("%s: %s stay %s", quote_path(path), fewer, evidence["poses"])
+    elif other is not None:
+        logger.warning("%s: %s: the first %d of both are used", quote_path(path), fewer, len(rows))
+    return poses, intrinsics, {**evidence, "poses_file": path.name}
 
 
 def _halve(frame: np.ndarray) -> np.ndarray:
@@ -194,3 +212,70 @@ def _rows(path: Path) -> Iterator[dict[str, str]]:
                     yield cells
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{name} cannot be read as CSV: {quote_text(str(error))}.") from error
+
+
+def _direct(
+    frames: UInt8[np.ndarray, "f h w 3"],
+    matrices: Float[np.ndarray, "f 4 4"],
+    other: Float[np.ndarray, "f 4 4"] | None,
+    intrinsics_px: Float[np.ndarray, "3 3"],
+) -> tuple[Float[np.ndarray, "f 4 4"] | None, Mapping[str, str]]:
+    """Return `world_from_camera` by the reading that fits the video, or None; and the evidence.
+
+    `other` has the poses of the frames if the poses are of another rate: they must not fit better.
+    """
+    readings = {"camera_to_world": matrices, "world_to_camera": invert(matrices)}
+    if other is not None:
+        readings |= {f"{RATE}_camera_to_world": other, f"{RATE}_world_to_camera": invert(other)}
+    errors: dict[str, list[float]] = {name: [] for name in readings}
+    for start in np.linspace(0, max(0, len(frames) - 1 - GAP), PAIRS).astype(int).tolist():
+        stop = min(start + GAP, len(frames) - 1)
+        points, moved = _track(frames[start], frames[stop])
+        if len(points) < MIN_TRACKS:
+            continue
+        for name, poses in readings.items():
+            relative = invert(poses[stop]) @ poses[start]
+            errors[name].append(_sampson_px(relative, points, moved, intrinsics_px))
+    medians = {n: float(np.median(e)) if e else float("nan") for n, e in errors.items()}
+    evidence = {f"epipolar_error_px_{name}": f"{value:.2f}" for name, value in medians.items()}
+    best, opposite = sorted([*readings][:2], key=lambda name: medians[name])
+    clear = medians[best] <= MAX_ERROR_PX and medians[opposite] >= MIN_RATIO * medians[best]
+    if min(medians.values()) < medians[best]:
+        return None, {"poses": "unknown: at another rate they fit the video better", **evidence}
+    if not clear:
+        return None, {"poses": "unknown: no reading clearly fits the video", **evidence}
+    return readings[best], {"poses": best, **evidence}
+
+
+def _track(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return pixels in the first frame and in the second, tracked forward and backward."""
+    import cv2
+
+    gray = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in (first, second)]
+    points = cv2.goodFeaturesToTrack(gray[0], 400, 0.01, 5)
+    if points is None:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    there, found, _ = cv2.calcOpticalFlowPyrLK(gray[0], gray[1], points, points.copy())
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(gray[1], gray[0], there, there.copy())
+    good = np.asarray(found, bool)[:, 0] & np.asarray(found_back, bool)[:, 0]
+    good &= np.linalg.norm(back - points, axis=-1)[:, 0] < 0.5
+    return points[good, 0].astype(float), there[good, 0].astype(float)
+
+
+def _sampson_px(
+    relative: Float[np.ndarray, "4 4"],
+    points: Float[np.ndarray, "n 2"],
+    moved: Float[np.ndarray, "n 2"],
+    intrinsics_px: Float[np.ndarray, "3 3"],
+) -> float:
+    """Return the median Sampson distance in pixels for a pose `second_from_first`."""
+    x, y, z = relative[:3, 3] / max(float(np.linalg.norm(relative[:3, 3])), 1e-12)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    inverse = np.linalg.inv(intrinsics_px)
+    fundamental = inverse.T @ cross @ relative[:3, :3] @ inverse
+    one = np.ones((len(points), 1))
+    first, second = np.hstack([points, one]), np.hstack([moved, one])
+    lines, back = first @ fundamental.T, second @ fundamental
+    size = np.hypot.reduce([*lines[:, :2].T, *back[:, :2].T])
+    distance = np.abs((second * lines).sum(axis=1)) / np.maximum(size, 1e-12)
+    return float(np.median(distance))

@@ -9,13 +9,17 @@ from egosim_jax.types import HAND_SIZE_M, Cameras, InputError, near_view
 
 
 def clean_joints(
-    joints_m: Float[np.ndarray, "f n j 3"], cameras: Cameras
-) -> tuple[Float[np.ndarray, "f n j 3"], dict[str, str]]:
+    joints_m: Float[np.ndarray, "f n j 3"] | None, cameras: Cameras | None
+) -> tuple[Float[np.ndarray, "f n j 3"] | None, dict[str, str]]:
     """Return joints with NaN for hands that are implausible or never near the view, and counts.
+
+    Returns None and no counts if joints are missing. Without cameras, the view is not known.
 
     Raises `InputError` if there are hands but none is ever near the view, because then joints and
     cameras are not in one world.
     """
+    if joints_m is None:
+        return None, {}
     joints = np.array(joints_m, float)
     finite = np.isfinite(joints).all(axis=(2, 3))
     joints[~finite] = np.nan
@@ -23,8 +27,8 @@ def clean_joints(
     low, high = HAND_SIZE_M
     odd = finite & ~((extent >= low) & (extent <= high))
     joints[odd] = np.nan
-    seen = near_view(cameras, joints).any(axis=0)
     given = np.isfinite(joints).all(axis=(2, 3)).any(axis=0)
+    seen = given if cameras is None else near_view(cameras, joints).any(axis=0)
     if given.any() and not seen.any():
         raise InputError(
             "No hand joint comes near the view of the camera in any frame: joints and camera poses "

@@ -44,7 +44,7 @@ from egosim_jax.io.bounded import (
 )
 from egosim_jax.io.images import decode_image
 from egosim_jax.io.timing import row_times
-from egosim_jax.io.video import write_frames
+from egosim_jax.io.writing import write_frames
 from egosim_jax.types import Cameras, InputError
 
 COLOR = "214-1"
@@ -105,13 +105,10 @@ class Hot3D:
             poses[:, :3, :3] = poses[:, :3, :3] @ CLOCKWISE
             (fx, _, cx), (_, fy, cy), _ = intrinsics.tolist()
             intrinsics = np.array([[fy, 0, lens.height - 1 - cy], [0, fx, cx], [0, 0, 1]])
-        notes: dict[str, str] = {"turned": "clockwise" if turned else "no"}
-        if joints is not None:
-            seen = Cameras(
-                world_from_camera=poses, intrinsics_px=intrinsics, height=height, width=width
-            )
-            joints, counts = clean_joints(joints, seen)
-            notes |= counts
+        seen = Cameras(
+            world_from_camera=poses, intrinsics_px=intrinsics, height=height, width=width
+        )
+        joints, counts = clean_joints(joints, seen)
         return Recording(
             recording_id=make_id([path.stem]),
             video=folder / "video.mp4",
@@ -123,7 +120,7 @@ class Hot3D:
             intrinsics_px=intrinsics,
             metric=True,
             joints_m=joints,
-            provenance=notes,
+            provenance={"turned": "clockwise" if turned else "no", **counts},
         )
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from datetime import datetime, timedelta
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path, PurePath
 from typing import no_type_check
 
@@ -16,13 +18,19 @@ from egosim_jax.data.readers import NOTE
 from egosim_jax.data.readers.lenses import Lens, Remap
 from egosim_jax.io.bounded import quote_text
 from egosim_jax.io.images import read_image
-from egosim_jax.io.video import write_frames
+from egosim_jax.io.writing import write_frames
 from egosim_jax.types import InputError
 
 MAX_IMAGES = 100_000
 """Maximum number of images in a capture."""
 MAX_JUMP = 1.5
 """Maximum ratio between the step of two numbers and the usual step of a capture."""
+_MOMENT = re.compile(
+    r"(?<![0-9])(?:((?:19|20)[0-9]{2})([^0-9]?)([01][0-9])\2([0-3][0-9])[^0-9]{0,3}"
+    r"([0-2][0-9])([^0-9]?)([0-5][0-9])\6([0-5][0-9])|([0-9]{10})(?=[_-]))"
+    r"(?:[._-]?([0-9]{9}|[0-9]{6}|[0-9]{3}))?(?![0-9])"
+)
+"""Date and time, or seconds since 1970, perhaps with decimals."""
 
 
 @no_type_check
@@ -75,55 +83,98 @@ def read_posed(path: Path, lens: Lens) -> UInt8[np.ndarray, "h w 3"]:
     return shown if shown.shape[:2] == (lens.height, lens.width) else image
 
 
-def longest_run(names: Sequence[str], known: Callable[[str], bool]) -> slice:
-    """Return the longest contiguous run of known names, because a video has no gaps.
+def longest_run(names: Sequence[str], known: Callable[[str], bool]) -> list[int]:
+    """Return the indices of the longest run of known names, because a video has no gaps.
 
-    A run also ends where the numbers in the names jump or another folder begins: images between
-    were not registered, or removed.
+    A run also ends where the numbers in the names jump: images between were not registered, or
+    removed. It ends where another folder or sequence begins, too. Images of two sequences may
+    alternate, so each number in turn is taken for the one that counts.
     """
-    follows = [False, *_follow(names)]
-    best = run = slice(0, 0)
-    for index, name in enumerate(names):
-        start = run.start if follows[index] else index
-        run = slice(start if known(name) else index + 1, index + 1)
-        if run.stop - run.start > best.stop - best.start:
-            best = run
+    parts, given = [_split(PurePath(name)) for name in names], [known(name) for name in names]
+    best: list[int] = []
+    for at in range(-1, max((len(part.numbers) for part in parts), default=0)):
+        order = list(range(len(names)))
+        if at >= 0:
+            order.sort(key=lambda index, at=at: parts[index].key(at))
+        follows = [False, *_follow([parts[index] for index in order])]
+        longest = run = slice(0, 0)
+        for place, index in enumerate(order):
+            start = run.start if follows[place] else place
+            run = slice(start if given[index] else place + 1, place + 1)
+            if run.stop - run.start > longest.stop - longest.start:
+                longest = run
+        best = max(best, order[longest], key=len)
     return best
 
 
-def describe_run(names: Sequence[str], run: slice) -> dict[str, str]:
+def describe_run(names: Sequence[str], run: Sequence[int]) -> dict[str, str]:
     """Return a recording's note on which of its images are used; nothing if all are."""
-    used = names[run]
-    if len(used) == len(names) or not used:
+    if len(run) == len(names) or not run:
         return {}
-    text = f"{len(used)} of {len(names)} images, the longest run without gaps: "
-    return {NOTE: text + f"{quote_text(used[0])} to {quote_text(used[-1])}"}
+    text = f"{len(run)} of {len(names)} images, the longest run without gaps: "
+    return {NOTE: text + f"{quote_text(names[run[0]])} to {quote_text(names[run[-1]])}"}
 
 
-def _follow(names: Sequence[str]) -> list[bool]:
+@dataclass(frozen=True)
+class _Parts:
+    texts: tuple[str, ...]
+    """Folder, and texts between the numbers."""
+    numbers: tuple[Fraction, ...]
+    """Numbers; date and time are one, in seconds."""
+    is_time: tuple[bool, ...]
+    """True for numbers with decimals, which are times."""
+
+    def key(self, at: int) -> tuple[tuple[str, ...], tuple[Fraction, ...]]:
+        """Return a sort key whose last part is the number `at`."""
+        rest = self.numbers[:at] + self.numbers[at + 1 :]
+        return self.texts, rest + self.numbers[at : at + 1]
+
+
+def _follow(parts: Sequence[_Parts]) -> list[bool]:
     """Return for each name after the first whether its image follows the one before.
 
-    The usual step between numbers is their median step. Names that do not differ in exactly one
-    number do not say.
+    Every number must change by about its usual step, the median. Of those that usually stay, only
+    a time in whole seconds may continue. Names without numbers do not say.
     """
-    steps = list(map(_step, names, names[1:]))
-    known = [step for step in steps if step is not None]
-    usual = float(np.percentile(known, 50, method="lower")) if known else 1.0
-    return [step is None or usual / MAX_JUMP < step < usual * MAX_JUMP for step in steps]
+    steps = [
+        [b - a for a, b in zip(first.numbers, second.numbers, strict=True)]
+        if first.texts == second.texts
+        else []
+        for first, second in pairwise(parts)
+    ]
+    most = max(map(len, steps), default=0)
+    columns = [[float(step[n]) for step in steps if len(step) > n] for n in range(most)]
+    usual = [float(np.percentile(column, 50, method="lower")) for column in columns]
+
+    def goes_on(step: Fraction, expected: float, is_time: bool) -> bool:
+        low, high = sorted((expected / MAX_JUMP, expected * MAX_JUMP))
+        return low < step < high or (not expected and 0 <= step <= is_time)
+
+    return [
+        any(step) and all(map(goes_on, step, usual, second.is_time))
+        if first.numbers or second.numbers
+        else first.texts[0] == second.texts[0] and first != second
+        for (first, second), step in zip(pairwise(parts), steps, strict=True)
+    ]
 
 
-def _step(name: str, following: str) -> float | None:
-    """Return the difference of two names' numbers; 0 for different folders, None if unknown."""
-    first, second = PurePath(name), PurePath(following)
-    if first.parent != second.parent or first == second:
-        return 0.0
-    texts, numbers = zip(*(_split(path.stem) for path in (first, second)), strict=True)
-    if texts[0] != texts[1]:
-        return None
-    steps = [b - a for a, b in zip(*numbers, strict=True) if a != b]
-    return float(steps[0]) if len(steps) == 1 else None
-
-
-def _split(stem: str) -> tuple[list[str], list[Fraction]]:
+def _split(path: PurePath) -> _Parts:
+    stem = _MOMENT.sub(_in_seconds, path.stem)
     parts = re.split(r"([0-9]{1,30}(?:\.[0-9]{1,30})?)", stem)
-    return parts[::2], [Fraction(part) for part in parts[1::2]]
+    return _Parts(
+        texts=(str(path.parent), *parts[::2]),
+        numbers=tuple(map(Fraction, parts[1::2])),
+        is_time=tuple("." in part for part in parts[1::2]),
+    )
+
+
+def _in_seconds(match: re.Match[str]) -> str:
+    """Return date and time as seconds, with at least one decimal."""
+    *moment, unix, decimals = match.group(1, 3, 4, 5, 7, 8, 9, 10)
+    if unix:
+        return f"{unix}.{decimals or 0}"
+    try:
+        at = datetime.fromisoformat("{}-{}-{} {}:{}:{}".format(*moment))
+    except ValueError:
+        return match[0]
+    return f"{(at - datetime.min) // timedelta(seconds=1)}.{decimals or 0}"

@@ -24,6 +24,8 @@ from jaxtyping import Float, UInt8
 
 from egosim_jax.types import InputError
 
+MAX_SPREAD = 0.01
+"""Maximum relative difference of a parameter between images of one camera."""
 MAX_ZOOM = 2.0
 """Maximum zoom to avoid black borders."""
 PINHOLE_PX = 0.5

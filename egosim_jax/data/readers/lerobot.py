@@ -4,9 +4,10 @@
     v3   meta/info.json, meta/tasks.parquet, meta/episodes/chunk-*/file-*.parquet; a video holds
          several episodes, each from `from_timestamp` to `to_timestamp` in seconds
 
-Row k of an episode belongs to the frame of its video that is nearest to the row's `timestamp`, or
-without that column to k / fps, in seconds after the episode's start (`io/timing.py`). Rows after
-the end of the video are omitted, with a warning.
+Row k of an episode belongs to the frame of its video that is nearest to the row's `timestamp`, in
+seconds after the episode's start (`io/timing.py`). Without that column, or if its values do not
+differ, row k belongs to k / fps. Rows at the video's rate must be as many as the frames of the
+episode. Rows of another rate after the end of the video are omitted, with a warning.
 
 Paths come from the templates in info.json; only the fields of the format are filled in. The format
 does not define cameras, hands and their units (a robot's state has no common meaning), so they stay
@@ -28,9 +29,10 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import tyro
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from egosim_jax.data.readers import Entry, inside, make_id, natural_order, require
+from egosim_jax.data.pairing import pair_rows
+from egosim_jax.data.readers import Entry, inside, make_id, make_rate, natural_order, require
 from egosim_jax.data.recording import MAX_FRAMES, Recording
 from egosim_jax.io.bounded import (
     listing,
@@ -40,10 +42,9 @@ from egosim_jax.io.bounded import (
     read_json,
     read_lines,
 )
-from egosim_jax.io.segments import probe_long_video
-from egosim_jax.io.timing import row_times
+from egosim_jax.io.timing import Timeline, row_times
 from egosim_jax.io.untrusted.parquet import read_parquet
-from egosim_jax.io.video import VideoInfo
+from egosim_jax.io.video import VideoInfo, probe_video
 from egosim_jax.types import InputError
 
 logger = logging.getLogger(__name__)
@@ -60,7 +61,8 @@ class _Episode:
     index: int
     video: Path
     start_s: float
-    stop_s: float
+    stop_s: float | None
+    """End of its part of the video; None if the video has no other episode."""
     data: Path | None
     length: int
     tasks: tuple[str, ...] | None
@@ -83,7 +85,7 @@ class LeRobot:
         camera, fps = _choose_camera(info["features"], self.camera), rate_of(info)
         episodes = _episodes_v3 if info["codebase_version"] == "v3.0" else _episodes_v2
         # Consecutive episodes share a video and a table.
-        probe, read = lru_cache(maxsize=1)(probe_long_video), lru_cache(maxsize=1)(_read_stamps)
+        probe, read = lru_cache(maxsize=1)(probe_video), lru_cache(maxsize=1)(_read_stamps)
         tasks = lru_cache(maxsize=1)(partial(_tasks_of_rows, self.source))
         for episode in episodes(self.source, info, camera):
             if isinstance(episode, str):
@@ -112,21 +114,40 @@ def _read(
 ) -> Recording:
     info = probe(episode.video)
     stamps = read(episode.data).get(episode.index) if episode.data else None
-    times_s, fps = _row_times(episode, stamps, fps)
-    times_s = episode.start_s + times_s
+    start_s, stop_s = episode.start_s, episode.stop_s
     end_s = (info.frames - 0.5) / float(info.fps)  # the last frame is the nearest until then
-    fits = (times_s < end_s) & (times_s < episode.stop_s - 0.5 / float(fps))
+    name = f"Episode {episode.index}, column timestamp"
+    first_s, timeline = 0.0, Timeline.even(episode.length, fps)
+    if stamps:
+        _, first_s, timeline = row_times(stamps, [fps], name)
+    whole = timeline.count == len(timeline.times_s)
+    after_s = timeline.times_s if whole else timeline.moments_s(0, timeline.count)
+    times_s, fps = start_s + first_s + after_s, timeline.fps
+    if not first_s and fps == info.fps and stop_s != np.inf:
+        frames = info.frames if stop_s is None else round((stop_s - start_s) * float(fps))
+        pair_rows(episode.video, info, episode.length, what="rows", frames=frames)
+    stop_s = end_s if stop_s is None else min(end_s, stop_s - 0.5 / float(fps))
+
+    def fit(times_s: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
+        return (start_s - 0.5 / float(fps) < times_s) & (times_s < stop_s)
+
+    fits, where = fit(times_s), f"which has {info.frames} frames in {end_s:.3f} s"
+    if not fits.all() and fit(start_s + after_s).all():
+        raise InputError(
+            f"{name}, is from {first_s:.3f} to {first_s + after_s[-1]:.3f} s, not all in its part "
+            f"of {quote_path(episode.video)}, {where}: it must be in seconds after the start of "
+            "the episode. Subtract its first value."
+        )
     if not fits.any():
         raise InputError(
             f"Episode {episode.index} begins at {times_s[0]:.3f} s of {quote_path(episode.video)}, "
-            f"which has {info.frames} frames in {end_s:.3f} s: the video is not the one that the "
-            "metadata describe. Download both again."
+            f"{where}: the video is not the one that the metadata describe. Download both again."
         )
     if len(times_s) != episode.length or not fits.all():
         logger.warning(
             "Episode %d: %d of %d rows are within %s, %.3f to %.3f s; the others are omitted",
             episode.index, fits.sum(), episode.length, quote_path(episode.video), episode.start_s,
-            min(end_s, episode.stop_s),
+            stop_s,
         )  # fmt: skip
     times_s = times_s[fits]
     start = _consecutive(info, times_s)
@@ -144,18 +165,6 @@ def _read(
         width=info.width,
         caption="; ".join(tasks) or None,
     )
-
-
-def _row_times(
-    episode: _Episode, stamps: list[Any] | None, fps: Fraction
-) -> tuple[Float[np.ndarray, " f"], Fraction]:
-    """Return the times of an episode's rows after its start in seconds, and their rate."""
-    if stamps is None:
-        return np.arange(episode.length) / float(fps), fps
-    _, first_s, timeline = row_times(stamps, [fps], f"Episode {episode.index}, column timestamp")
-    whole = timeline.count == len(timeline.times_s)
-    times_s = timeline.times_s if whole else np.arange(timeline.count) / float(timeline.fps)
-    return first_s + times_s, timeline.fps
 
 
 def _consecutive(info: VideoInfo, times_s: Float[np.ndarray, " f"]) -> int | None:
@@ -189,15 +198,13 @@ def read_info(root: Path, versions: Sequence[str] = VERSIONS) -> dict[str, Any]:
             f"{root} is of LeRobot version {quote(version)}; supported are {', '.join(versions)}. "
             "Convert it with LeRobot's own script."
         )
-    fps = info.get("fps")
-    if not isinstance(fps, (int, float)) or not 0 < fps <= 1000:
-        raise InputError(f"{root}/meta/info.json: fps is {quote(fps)}, not a rate.")
+    rate_of(info)
     return info
 
 
 def rate_of(info: Mapping[str, Any]) -> Fraction:
     """Return the frame rate of a dataset's tables."""
-    return Fraction(info["fps"]).limit_denominator(1001) or Fraction(info["fps"])
+    return make_rate(info.get("fps", 0), what="fps in meta/info.json")
 
 
 def read_rows(
@@ -291,7 +298,7 @@ def _episodes_v2(root: Path, info: Mapping[str, Any], camera: str) -> Iterator[_
                 index=number,
                 video=_video_path(root, info, camera, fields),
                 start_s=0.0,
-                stop_s=float("inf"),
+                stop_s=None,
                 data=_data_path(root, info, fields),
                 length=_count(row.get("length"), "length", minimum=1),
                 tasks=_texts(row.get("tasks")),
@@ -413,4 +420,5 @@ def _time(value: Any, name: str) -> float:
 
 
 def _texts(value: Any) -> tuple[str, ...]:
-    return tuple(text for text in value if isinstance(text, str)) if isinstance(value, list) else ()
+    texts = value if isinstance(value, list) else [value]
+    return tuple(text for text in texts if isinstance(text, str))

@@ -11,6 +11,7 @@ instant-ngp's `is_fisheye`.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,8 +22,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 import tyro
 
-from egosim_jax.data.readers import Entry, inside, make_id, natural_order
-from egosim_jax.data.readers.colmap import make_rate
+from egosim_jax.data.readers import Entry, inside, make_id, make_rate, natural_order
 from egosim_jax.data.readers.images import (
     MAX_IMAGES,
     ImageVideo,
@@ -31,7 +31,7 @@ from egosim_jax.data.readers.images import (
     read_posed,
     write_images,
 )
-from egosim_jax.data.readers.lenses import Lens
+from egosim_jax.data.readers.lenses import MAX_SPREAD, Lens
 from egosim_jax.data.readers.rotations import OPENCV_FROM_OPENGL
 from egosim_jax.data.recorded_files import DepthFiles
 from egosim_jax.data.recording import Recording
@@ -61,8 +61,6 @@ _MEANING = re.compile(
     r"^f[xy]$|^fl_|^[ckps][xy0-9]+$"
 )
 """Words of keys that may change cameras or poses."""
-MAX_SPREAD = 0.01
-"""Maximum relative difference of focal lengths between frames; the median is used."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +101,7 @@ class Nerfstudio:
         problems = {str(image): _problem(image, entry, path) for image, entry in images}
         names = [str(image.relative_to(path.parent)) for image, _ in images]
         run = longest_run(list(problems), lambda name: problems[name] is None)
-        images = images[run]
+        images = [images[index] for index in run]
         if not images:
             raise InputError(next(filter(None, problems.values())))
         frames = [entry for _, entry in images]
@@ -241,7 +239,7 @@ def _problem(image: Path, entry: Mapping[str, Any], path: Path) -> str | None:
             f"{quote_path(path)}: the transform_matrix of {name} is not a rigid transform: it must "
             "be finite, with a rotation of determinant 1. Register the images again."
         )
-    return None if image.is_file() else f"{quote_path(image)} is missing."
+    return None if os.path.lexists(image) else f"{quote_path(image)} is missing."
 
 
 def _find_depth(root: Path, frames: list[dict[str, Any]], video: ImageVideo) -> DepthFiles | None:

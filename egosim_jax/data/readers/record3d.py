@@ -5,18 +5,24 @@
                         perFrameIntrinsicCoeffs (fx fy cx cy, at w x h), frameTimestamps (seconds)
         rgbd/<n>.jpg    images
         rgbd/<n>.depth  float32 meters `dh dw`, compressed by LZFSE
+        rgbd/<n>.conf   uint8 `dh dw`, compressed, too: 0 low, 1 medium, 2 high; may be absent
 
 or a folder exported as "EXR + RGB", with metadata.json and rgb/<n>.jpg, whose EXR depth is not
 read. Poses are camera to world in ARKit's axes, which are OpenGL's, in meters; the world is y up.
 Images are taken by their time stamps (`io/timing.py`). Pixel coordinates start at the corner of the
 image, so half a pixel is subtracted. ARKit refocuses continuously; the median over the frames is
-used if the focal length changes little. Depth is written as PNG in millimeters and needs the
-package pyliblzfse. Without it, depth is unknown, and the recording says so. Followed: nerfstudio
-1.1, `record3d_utils.py`, and readers of .r3d files of 2025.
+used if the focal length changes little. Depth of low confidence is unknown; if a capture has
+confidences, so is the depth of a frame without them. Depth is written as PNG in millimeters and
+needs the package lzfse. Without it, depth is unknown, and the recording says so. That library
+limits no size, so the declared size of a stream is checked before. A stream is a sequence of
+blocks, each with the number of bytes that it decompresses to, and ends with `bvx$` (Apple's
+`lzfse_internal.h`).
+Followed: nerfstudio 1.1, `record3d_utils.py`, and readers of .r3d files of 2025.
 """
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -31,7 +37,7 @@ import numpy as np
 import tyro
 from PIL import Image
 
-from egosim_jax.data.readers import Entry, make_id, natural_order
+from egosim_jax.data.readers import Entry, check_one_camera, make_id, make_rate, natural_order
 from egosim_jax.data.readers.images import (
     MAX_IMAGES,
     describe_run,
@@ -39,7 +45,6 @@ from egosim_jax.data.readers.images import (
     write_images,
 )
 from egosim_jax.data.readers.lenses import Lens
-from egosim_jax.data.readers.lzfse import unpack
 from egosim_jax.data.readers.rotations import OPENCV_FROM_OPENGL, make_poses
 from egosim_jax.data.recorded_files import DepthFiles
 from egosim_jax.data.recording import Recording
@@ -58,12 +63,16 @@ from egosim_jax.io.untrusted.npz import DAMAGE
 from egosim_jax.io.untrusted.zipped import from_file
 from egosim_jax.types import InputError, is_rigid
 
+logger = logging.getLogger(__name__)
+
 MAX_FILE_BYTES = 1 << 28
 """Maximum size of a file in a capture or archive, in bytes."""
 MAX_SPREAD = 0.03
 """Maximum relative change of the focal length during a capture."""
 MAX_DEPTH_SIDE = 4096
 """Maximum height and width of a depth map in pixels."""
+MIN_CONFIDENCE = 1
+"""Minimum confidence of used depth: 0 is ARKit's low, 1 its medium."""
 _IMAGE = re.compile(r"(?:rgbd|rgb)/(\d{1,9})\.jpg")
 
 ReadFile = Callable[[str], bytes]
@@ -113,7 +122,8 @@ def _read(path: Path, folder: Path) -> Recording:
         used = dict(zip((numbered[number] for number in numbers), rigid[numbers], strict=True))
         run = longest_run(list(used), used.__getitem__)
         notes = describe_run(list(used), run)
-        numbers = numbers[run] or numbers  # without a pose, the recording names the first
+        if run:  # without a pose, the recording names the first
+            numbers = [numbers[index] for index in run]
         numbers, fps = _moments(metadata, numbers, path)
         poses = poses[numbers]
         images = (
@@ -130,7 +140,7 @@ def _read(path: Path, folder: Path) -> Recording:
         height=video.height,
         width=video.width,
         world_from_camera=poses,
-        intrinsics_px=video.intrinsics_px,
+        intrinsics_px=video.intrinsics_px if np.isfinite(spread) else None,
         metric=True,
         depth=depth,
         provenance={"focal_spread": f"{spread:.4f}", "depth": why, **notes},
@@ -141,7 +151,7 @@ def _read(path: Path, folder: Path) -> Recording:
 def _open_capture(path: Path) -> Iterator[tuple[list[str], ReadFile]]:
     """Open an archive or folder; yield its file names and a function that reads a file."""
     if path.is_dir():
-        files = (file for file in path.glob("**/*") if file.is_file())
+        files = (file for file in path.glob("**/*") if not file.is_dir())
         names = [str(file.relative_to(path)) for file in files]
         yield names, lambda name: read_bytes(path / name, limit=MAX_FILE_BYTES)
         return
@@ -210,7 +220,7 @@ def _moments(
 
     Captures without time stamps have the rate that they state.
     """
-    fps = Fraction(_number(metadata, "fps", path)).limit_denominator(1001)
+    fps = make_rate(metadata.get("fps", 0), what=f"{quote_path(path)}: fps")
     stamps = metadata.get("frameTimestamps")
     if not isinstance(stamps, list) or not stamps:
         return numbers, fps
@@ -227,10 +237,12 @@ def _moments(
 
 
 def _lens(metadata: dict[str, Any], frames: int, path: Path) -> tuple[Lens, float]:
-    """Return the camera and the relative spread of its focal length over the frames."""
+    """Return the camera and its focal length's relative spread, NaN without intrinsics."""
     width, height = (int(_number(metadata, name, path)) for name in ("w", "h"))
     if metadata.get("perFrameIntrinsicCoeffs"):
         table = _numbers(metadata, "perFrameIntrinsicCoeffs", 4, path)
+    elif not metadata.get("K"):
+        table = np.full((1, 4), np.nan)
     else:
         matrix = _numbers({"K": [metadata.get("K")]}, "K", 9, path)[0]
         table = matrix[[0, 4, 6, 7]][None]
@@ -239,13 +251,10 @@ def _lens(metadata: dict[str, Any], frames: int, path: Path) -> tuple[Lens, floa
             f"{quote_path(path)}: perFrameIntrinsicCoeffs has {len(table)} rows for {frames} "
             "frames."
         )
-    fx, fy, cx, cy = np.median(table, axis=0).tolist()
-    spread = float(np.ptp(table[:, 0])) / max(fx, 1e-9)
-    if spread > MAX_SPREAD:
-        raise InputError(
-            f"{quote_path(path)}: the focal length changes by {spread:.1%} during the capture, "
-            f"more than {MAX_SPREAD:.0%}: one camera is needed for all frames. Lock the focus."
-        )
+    if np.isnan(table).any():
+        logger.warning("%s has no K: its intrinsics stay unknown", quote_path(path))
+    fx, fy, cx, cy = np.nan_to_num(np.median(table, axis=0), nan=1.0).tolist()
+    spread = check_one_camera(table[:, 0], quote_path(path), most=MAX_SPREAD)
     return Lens(
         model="brown",
         coefficients=(0.0,) * 5,
@@ -268,22 +277,75 @@ def _write_depth(
     found = [f"rgbd/{number}.depth" in known for number in numbers]
     if not any(found):
         return None, "none"
-    if find_spec("liblzfse") is None:
-        return None, "not read: pip install pyliblzfse"
+    if find_spec("lzfse") is None:
+        return None, "not read: pip install 'egosim-jax[video]'"
     columns, rows = (int(_number(metadata, name, path)) for name in ("dw", "dh"))
     if max(columns, rows) > MAX_DEPTH_SIDE:
         raise InputError(f"{quote_path(path)}: depth of {columns}x{rows} pixels is too large.")
     paths: list[Path | None] = [None] * len(numbers)
+    judged = any(name.endswith(".conf") for name in names)
+
+    def unpack(name: str, dtype: str) -> np.ndarray:
+        try:
+            data = unpack_lzfse(read(name), np.dtype(dtype).itemsize * rows * columns)
+        except ValueError as error:
+            raise InputError(f"{quote_path(path)}: {name} is damaged: {error}.") from error
+        return np.frombuffer(data, dtype).reshape(rows, columns)
+
     for frame, number in enumerate(numbers):
-        if found[frame]:
-            name = f"rgbd/{number}.depth"
-            try:
-                data = unpack(read(name), 4 * rows * columns)
-            except ValueError as error:
-                raise InputError(f"{quote_path(path)}: {name} is damaged: {error}.") from error
-            meters = np.frombuffer(data, "<f4").reshape(rows, columns)
-            meters = np.where(np.isfinite(meters) & (meters > 0) & (meters < 65), meters, 0)
+        confidence = f"rgbd/{number}.conf"
+        if found[frame] and (confidence in known or not judged):
+            meters = unpack(f"rgbd/{number}.depth", "<f4")
+            good = np.isfinite(meters) & (meters > 0) & (meters < 65)
+            if judged:
+                good &= unpack(confidence, "u1") >= MIN_CONFIDENCE
+            meters = np.where(good, meters, 0)
             paths[frame] = target = folder / "depth" / f"{number:06d}.png"
             with atomic_write(target) as temporary:
                 Image.fromarray(np.rint(1000 * meters).astype(np.uint16)).save(temporary)
-    return DepthFiles(paths=tuple(paths), unit_m=0.001), "LiDAR"
+    source = "LiDAR of medium and high confidence" if judged else "LiDAR"
+    return DepthFiles(paths=tuple(paths), unit_m=0.001), source
+
+
+def unpack_lzfse(data: bytes, size: int) -> bytes:
+    """Decompress an LZFSE stream to `size` bytes. Raises `ValueError` if it has another size.
+
+    Data that already has that size is returned unchanged: some apps do not compress.
+    """
+    if len(data) == size:
+        return data
+    if (declared := unpacked_size(data)) != size:
+        raise ValueError(f"it unpacks to {declared:,} bytes; expected {size:,}")
+    import lzfse
+
+    try:
+        unpacked = lzfse.decompress(data)
+    except (lzfse.error, MemoryError) as error:  # it looks for ever more room for a damaged block
+        raise ValueError("a block cannot be unpacked") from error
+    if len(unpacked) != size:
+        raise ValueError(f"it unpacked to {len(unpacked):,} bytes; expected {size:,}")
+    return unpacked
+
+
+def unpacked_size(data: bytes) -> int:
+    """Return the total declared size of the blocks. Raises `ValueError` if this is not LZFSE."""
+
+    def number(at: int, count: int) -> int:
+        if at + count > len(data):
+            raise ValueError("it is cut off")
+        return int.from_bytes(data[at : at + count], "little")
+
+    at, total = 0, 0
+    while data[at : at + 4] != b"bvx$":
+        magic, raw = data[at : at + 4], number(at + 4, 4)
+        if magic == b"bvx2":
+            literals, lengths, header = (number(at + 8 * n, 8) for n in (1, 2, 3))
+            length = (header & 0xFFFFFFFF) + (literals >> 20 & 0xFFFFF) + (lengths >> 40 & 0xFFFFF)
+        elif magic == b"bvxn":
+            length = 12 + number(at + 8, 4)
+        elif magic == b"bvx-":
+            length = 8 + raw
+        else:
+            raise ValueError("it is not an LZFSE stream")
+        at, total = at + max(length, 8), total + raw
+    return total

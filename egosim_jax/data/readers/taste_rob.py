@@ -28,7 +28,7 @@ from egosim_jax.io.bounded import (
     quote_text,
     read_bytes,
 )
-from egosim_jax.io.segments import probe_long_video
+from egosim_jax.io.video import probe_video
 from egosim_jax.types import InputError
 
 VIDEO_COLUMNS = ("video", "video_path", "file", "file_name", "filename", "path", "name")
@@ -59,7 +59,7 @@ class TasteRob:
 
 def _read(root: Path, name: str, caption: str, folder: Path) -> Recording:
     video = inside(root, name, what="the video of a row")
-    info = probe_long_video(video)
+    info = probe_video(video)
     return Recording(
         recording_id=make_id([video.stem]),
         video=video,

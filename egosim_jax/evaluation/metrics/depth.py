@@ -15,10 +15,10 @@ def depth_error(
 
     NaN without such pixels.
     """
-    known = counted & np.isfinite(depth_m) & np.isfinite(target_m) & (depth_m > 0) & (target_m > 0)
-    if not known.any():
+    valid = counted & np.isfinite(depth_m) & np.isfinite(target_m) & (depth_m > 0) & (target_m > 0)
+    if not valid.any():
         return float("nan")
-    depth, target = depth_m[known].astype(float), target_m[known].astype(float)
+    depth, target = depth_m[valid].astype(float), target_m[valid].astype(float)
     return float(100 * np.mean(np.abs(depth - target) / target))
 
 

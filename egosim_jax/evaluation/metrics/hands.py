@@ -41,8 +41,8 @@ def hand_iou(
     for here, there in zip(found_px, target_px, strict=True):
         target = hull_mask(there, height, width)
         if target.any():
-            found = hull_mask(here, height, width)
-            values.append((found & target).sum() / (found | target).sum())
+            hull = hull_mask(here, height, width)
+            values.append((hull & target).sum() / (hull | target).sum())
     return float(np.mean(values)) if values else float("nan")
 
 

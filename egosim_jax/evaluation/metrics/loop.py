@@ -62,7 +62,7 @@ def score_step(
         path = estimate_cameras(frames, ground_truth.frames, depth_m, ~acted, cameras)
         scores["depth_error"] = depth_error(after.depth_m, depth_m, last)
         scores["depth_known"] = coverage(after.depth_m, last)
-        found = np.isfinite(path).all(axis=(1, 2))
-        scores["camera_known"] = 100 * float(found.mean())
+        located = np.isfinite(path).all(axis=(1, 2))
+        scores["camera_known"] = 100 * float(located.mean())
         scores["camera_error"] = 1000 * camera_errors(path, cameras.world_from_camera)[0]
     return scores

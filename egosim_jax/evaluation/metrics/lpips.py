@@ -163,15 +163,15 @@ class Lpips(nnx.Module):
 
     def features(self, images: Images) -> list[Float[Array, "b _ _ _"]]:
         """Return the normalized features of images at each compared layer."""
-        x, found = _whiten(images), []
+        x, features = _whiten(images), []
         for number, stage in enumerate(self.stages):
             if number in self.config.pooled:
                 window = (self.config.window,) * 2
                 x = nnx.max_pool(x, window, strides=(2, 2))
             for layer in stage:
                 x = nnx.relu(layer(x))
-            found.append(_normalize(x))
-        return found
+            features.append(_normalize(x))
+        return features
 
     def distances(self, ours: Sequence[Array], theirs: Sequence[Array]) -> Float[Array, " b"]:
         """Return the distance of each pair of images, given the features of both."""

@@ -20,6 +20,10 @@ SHADES = (0.45, 1.15)
 """Minimum and maximum light on a surface."""
 MIN_VISIBLE_PX = 20
 """Minimum number of pixels of an object in a frame for it to count as visible."""
+RIGHT_LEVELS = 30
+"""Maximum difference of a pixel that counts as right, in 8-bit levels."""
+MOVING_M = 0.001
+"""Minimum motion of an object between two frames in which it moves, in meters."""
 CENTROID_RADIUS = 0.12
 """Radius around an object's median pixel for its centroid, as a fraction of the width."""
 
@@ -75,21 +79,56 @@ def region_psnr(
     region: Bool[np.ndarray, "f h w"],
 ) -> float:
     """Return the PSNR in dB over the pixels of a region in all frames; NaN if it is empty."""
+    return float(decibels(np.asarray(squared_error(video, target, region))))
+
+
+def squared_error(
+    video: UInt8[np.ndarray, "f h w 3"],
+    target: UInt8[np.ndarray, "f h w 3"],
+    region: Bool[np.ndarray, "f h w"],
+) -> float:
+    """Return the mean squared error in 8-bit levels over a region; NaN if it is empty."""
     if not region.any():
         return float("nan")
-    return float(decibels(np.square(video[region].astype(np.float64) - target[region]).mean()))
+    return float(np.square(video[region].astype(np.float64) - target[region]).mean())
 
 
-def silhouette_iou(found: Bool[np.ndarray, "f h w"], target: Bool[np.ndarray, "f h w"]) -> float:
+def right_share(
+    video: UInt8[np.ndarray, "f h w 3"],
+    target: UInt8[np.ndarray, "f h w 3"],
+    region: Bool[np.ndarray, "f h w"],
+) -> float:
+    """Return the share of a region's pixels within 30 levels of the target; NaN if it is empty."""
+    if not region.any():
+        return float("nan")
+    gaps = np.abs(video[region].astype(int) - target[region]).max(axis=-1)
+    return float((gaps <= RIGHT_LEVELS).mean())
+
+
+def held_and_released(
+    path: Float[np.ndarray, "f 4 4"],
+) -> tuple[Bool[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
+    """Return the frames in which an object moves, and the frames after it came to rest."""
+    moving = np.zeros(len(path), bool)
+    moving[1:] = np.linalg.norm(np.diff(path[:, :3, 3], axis=0), axis=1) > MOVING_M
+    after = np.zeros(len(path), bool)
+    if moving.any():
+        after[np.flatnonzero(moving)[-1] + 1 :] = True
+    return moving, after
+
+
+def silhouette_iou(
+    silhouettes: Bool[np.ndarray, "f h w"], target: Bool[np.ndarray, "f h w"]
+) -> float:
     """Return the IoU, averaged over the frames with target pixels; NaN without such frames."""
     shown = target.any(axis=(1, 2))
-    both = (found & target).sum(axis=(1, 2))[shown]
-    either = (found | target).sum(axis=(1, 2))[shown]
+    both = (silhouettes & target).sum(axis=(1, 2))[shown]
+    either = (silhouettes | target).sum(axis=(1, 2))[shown]
     return float((both / either).mean()) if shown.any() else float("nan")
 
 
 def centroid_errors(
-    found: Bool[np.ndarray, "f h w"], target: Bool[np.ndarray, "f h w"]
+    silhouettes: Bool[np.ndarray, "f h w"], target: Bool[np.ndarray, "f h w"]
 ) -> Float[np.ndarray, " g"]:
     """Return the distances in pixels between the centroids of two silhouettes.
 
@@ -99,16 +138,16 @@ def centroid_errors(
     width = target.shape[2]
     shown = _visible(target)
     errors = []
-    for here, there in zip(found[shown], target[shown], strict=True):
+    for here, there in zip(silhouettes[shown], target[shown], strict=True):
         gap = _centroid(here) - _centroid(there) if here.any() else np.array([width, 0.0])
         errors.append(np.hypot(*gap))
     return np.array(errors)
 
 
-def lost_share(found: Bool[np.ndarray, "f h w"], target: Bool[np.ndarray, "f h w"]) -> float:
+def lost_share(silhouettes: Bool[np.ndarray, "f h w"], target: Bool[np.ndarray, "f h w"]) -> float:
     """Return the fraction of frames with a visible but lost target; NaN if it is never visible."""
     shown = _visible(target)
-    return float((~found[shown].any(axis=(1, 2))).mean()) if shown.any() else float("nan")
+    return float((~silhouettes[shown].any(axis=(1, 2))).mean()) if shown.any() else float("nan")
 
 
 def _visible(silhouettes: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, " f"]:

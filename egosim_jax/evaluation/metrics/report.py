@@ -36,9 +36,9 @@ def mean_and_spread(values: Iterable[float]) -> tuple[float, float]:
 
     The mean of no values is NaN, and so is the deviation of fewer than two values.
     """
-    known = [value for value in values if np.isfinite(value)]
-    mean = float(np.mean(known)) if known else float("nan")
-    return mean, float(np.std(known, ddof=1)) if len(known) > 1 else float("nan")
+    finite = [value for value in values if np.isfinite(value)]
+    mean = float(np.mean(finite)) if finite else float("nan")
+    return mean, float(np.std(finite, ddof=1)) if len(finite) > 1 else float("nan")
 
 
 def summarize(
@@ -55,9 +55,9 @@ def summarize(
             continue
         values = [score.get(name, float("nan")) for score in scores]
         mean, spread = mean_and_spread(values)
-        known = int(np.isfinite(values).sum())
-        counts = {} if known == len(values) else {"known": known, "of": len(values)}
-        spreads = {"spread": spread} if known > 1 else {}
+        valid = int(np.isfinite(values).sum())
+        counts = {} if valid == len(values) else {"known": valid, "of": len(values)}
+        spreads = {"spread": spread} if valid > 1 else {}
         summary[name] = {"mean": mean, **spreads, **counts}
     return summary
 
@@ -89,12 +89,12 @@ def paired_difference(
     from scipy.special import stdtrit
 
     pairs = np.subtract(values, reference)
-    known = pairs[~np.isnan(pairs)]
-    counts = {} if len(known) == len(pairs) else {"known": len(known), "of": len(pairs)}
-    mean, spread = mean_and_spread(known)
-    if len(known) < 2:
+    valid = pairs[~np.isnan(pairs)]
+    counts = {} if len(valid) == len(pairs) else {"known": len(valid), "of": len(pairs)}
+    mean, spread = mean_and_spread(valid)
+    if len(valid) < 2:
         return {"mean": mean, **counts}
-    half = float(stdtrit(len(known) - 1, (1 + level) / 2)) * spread / len(known) ** 0.5
+    half = float(stdtrit(len(valid) - 1, (1 + level) / 2)) * spread / len(valid) ** 0.5
     return {"mean": mean, "low": mean - half, "high": mean + half, **counts}
 
 
@@ -122,7 +122,8 @@ def print_table(
     for row, summary in rows.items():
         cells = (cell_of(summary.get(name, {}), form) for name, (_, form) in measures.items())
         table.add_row(row, *cells)
-    make_console(width=160).print(table)
+    table.columns[0].overflow = "fold"  # a name is never cut
+    make_console(width=1000).print(table)
 
 
 def cell_of(value: Mapping[str, float], form: str) -> str:

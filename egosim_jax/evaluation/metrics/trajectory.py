@@ -103,10 +103,10 @@ def camera_errors(
 
     Frames without a finite pose are ignored: report their number, too. NaN if no pose is finite.
     """
-    known = np.isfinite(world_from_camera).all(axis=(1, 2))
-    if not known.any():
+    located = np.isfinite(world_from_camera).all(axis=(1, 2))
+    if not located.any():
         return float("nan"), float("nan")
-    between = invert(target[known]) @ world_from_camera[known]
+    between = invert(target[located]) @ world_from_camera[located]
     meters = np.linalg.norm(between[:, :3, 3], axis=1)
     return _rms(meters), _rms(rotation_angles_deg(between))
 
@@ -130,12 +130,12 @@ def path_errors(
     The extent of a path is the maximum distance from its first camera, or 1 if it does not move.
     Frames without a finite pose are ignored. NaN if the first pose is not finite, or no other is.
     """
-    known = np.asarray(np.isfinite(world_from_camera).all(axis=(1, 2)))
-    if not known[0] or known.sum() < 2:
+    located = np.asarray(np.isfinite(world_from_camera).all(axis=(1, 2)))
+    if not located[0] or located.sum() < 2:
         return PathErrors(float("nan"), float("nan"), float("nan"))
-    found, wanted = (invert(p[0]) @ p[known] for p in (world_from_camera, target))
-    between = invert(wanted) @ found
-    here, there = found[:, :3, 3], wanted[:, :3, 3]
+    estimated, wanted = (invert(p[0]) @ p[located] for p in (world_from_camera, target))
+    between = invert(wanted) @ estimated
+    here, there = estimated[:, :3, 3], wanted[:, :3, 3]
     strength = np.square(here).sum()
     scale = max((here * there).sum() / strength, 0.0) if strength else 1.0
     return PathErrors(

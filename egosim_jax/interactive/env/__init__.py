@@ -31,11 +31,14 @@ if TYPE_CHECKING:
     from egosim_jax.interactive.env.backends import Backend
     from egosim_jax.interactive.env.single import WorldEnv
     from egosim_jax.interactive.env.vector import WorldVectorEnv
+    from egosim_jax.simulation.episode import Episode
 
 __all__ = ["ActionSpec", "Start", "load_backend", "make", "make_vec", "register"]
 
 ID = "egosim_jax/Tabletop-v0"
 World = Literal["generated", "true"]
+MODEL = "tabletop"
+"""Model by default."""
 _POSITIONAL = ("backend", "num_envs")
 
 
@@ -43,26 +46,28 @@ _POSITIONAL = ("backend", "num_envs")
 def load_backend(
     world: World = "generated",
     *,
-    config: str = "tabletop",
+    config: str | None = None,
     weights: Path | str | None = None,
     perception: str = "classical",
     steps: int | None = None,
     batch: int = 1,
     compile: bool = True,
     update_every: Literal["clip", "chunk"] = "clip",
+    default: str = MODEL,
+    episode: Episode | None = None,
 ) -> Backend:
     """Return the true tabletop world, or a model's world that batches up to `batch` clips.
 
+    `config` names a model, or "preview", which needs no weights. Without it the model is `default`,
+    and scenes that its weights were not made for get previews, as does all if `episode` is one.
     The model is compiled for all batch sizes now, over all devices. Stderr lists all that is loaded
     and compiled. Without `compile` it is compiled at the first step. `update_every` updates the
     state after each clip or, with a causal student, after each chunk of a clip.
     """
     if world not in get_args(World):
         raise InputError(f"There is no world {world!r:.40}: it must be 'generated' or 'true'.")
-    with phase(f"loads JAX and the {world} world of {config}"):
-        from dataclasses import replace
-
-        from egosim_jax import configs
+    with phase(f"loads JAX and the {world} world of {config or default}"):
+        from egosim_jax.generation.choose import choose
         from egosim_jax.generation.generator import Generator
         from egosim_jax.interactive.env.backends import GeneratedWorld
         from egosim_jax.interactive.env.batching import Batcher
@@ -71,23 +76,31 @@ def load_backend(
         from egosim_jax.simulation.simulator import check_update_every
         from egosim_jax.types import MeshConfig
 
-    model = configs.get(config)
-    model = replace(model, steps=steps or model.steps)
+    folder = None if weights is None else Path(weights)
+    maker = choose(
+        config,
+        folder,
+        default=default,
+        steps=steps,
+        provenance=episode and episode.state.provenance,
+        video=episode and episode.video,
+    )
     if world == "true":
-        return TrueWorld(video=model.video)
-    check_update_every(update_every, model.chunk_frames, model.name, perception)
+        return TrueWorld(video=maker.video)
+    check_update_every(update_every, maker.chunk_frames, maker.name, perception)
     mesh = make_mesh(MeshConfig(data=-1, fsdp=1))
-    folder = configs.weights_of(config, None if weights is None else Path(weights))
-    generator = Generator.load(model, folder, mesh=mesh)
-    unit = parts("batch", mesh)
-    batcher = Batcher(generator, max_batch=max(batch, unit), unit=unit)
-    if compile:
-        generator.compile(*batcher.sizes, streamed=True)
+    generator = maker.load(mesh=mesh)
+    if isinstance(generator, Generator):
+        unit = parts("batch", mesh)
+        generator, model = Batcher(generator, max_batch=max(batch, unit), unit=unit), generator
+        if compile:
+            model.compile(*generator.sizes, streamed=True)
     return GeneratedWorld(
-        generator=batcher,
-        video=model.video,
+        generator=generator,
+        video=maker.video,
         perception=perception,
-        trained_on=configs.trained_on(config, folder),
+        trained_on=maker.trained_on,
+        previews_others=config is None and weights is None,
         update_every=update_every,
     )
 
@@ -130,11 +143,12 @@ def _check_options(env: type, backend: Any, world: Any, options: Mapping[str, An
         raise InputError(f"The backend is {backend!r:.40}: name a world by world=.")
     checked = ("actions", "observe", "max_chunks")
     check_settings(**{name: options[name] for name in checked if name in options})
-    known = ["backend", "world", *(n for n in signature(env).parameters if n not in _POSITIONAL)]
-    if unknown := [name for name in options if name not in known]:
+    fields = [name for name in signature(env).parameters if name not in _POSITIONAL]
+    allowed = ["backend", "world", *fields]
+    if unknown := [name for name in options if name not in allowed]:
         raise InputError(
-            f"There is no option {unknown[0]!r:.40} of an environment.{meant(unknown[0], known)} "
-            f"Options: {', '.join(known)}."
+            f"There is no option {unknown[0]!r:.40} of an environment.{meant(unknown[0], allowed)} "
+            f"Options: {', '.join(allowed)}."
         )
 
 

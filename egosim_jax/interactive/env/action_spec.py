@@ -46,12 +46,12 @@ def to_numbers(rows: object) -> Float[np.ndarray, ...]:
     Raises `InputError` for text, rows of unequal length, and integers beyond 64 bits.
     """
     try:
-        found = np.asarray(rows)
+        numbers = np.asarray(rows)
     except (TypeError, ValueError, OverflowError):
-        found = np.empty(0, object)
-    if found.dtype.kind not in "biuf":
+        numbers = np.empty(0, object)
+    if numbers.dtype.kind not in "biuf":
         raise InputError(f"The actions are {quote(rows)}: they must be rows of numbers.")
-    return found.astype(np.float64)
+    return numbers.astype(np.float64)
 
 
 @no_type_check
@@ -106,8 +106,8 @@ class ActionSpec:
     def names(self) -> tuple[str, ...]:
         """Name of each number of a row."""
         joints = [f"joint {joint} {axis}" for joint in range(JOINTS["human"]) for axis in "xyz"]
-        own = joints if self.layout == "keypoints" else HAND_NAMES
-        hands = [f"{side} {name}" for side in self.sides for name in own]
+        of_hand = joints if self.layout == "keypoints" else HAND_NAMES
+        hands = [f"{side} {name}" for side in self.sides for name in of_hand]
         return (*hands, *(CAMERA_NAMES if self.camera else ()))
 
     @cached_property
@@ -139,14 +139,14 @@ class ActionSpec:
 
     def check_row(self, row: object) -> Float[np.ndarray, " d"]:
         """Return one row as an array; raise `InputError` as `check` does."""
-        found = to_numbers(row)
-        if found.shape != (len(self.names),):
+        numbers = to_numbers(row)
+        if numbers.shape != (len(self.names),):
             raise InputError(
-                f"The action has shape {found.shape}: a step takes one row of {self.about}, of "
+                f"The action has shape {numbers.shape}: a step takes one row of {self.about}, of "
                 f"shape ({len(self.names)},). Give several rows, one for each frame, to "
                 "env.unwrapped.chunk_step."
             )
-        return self.check(found[None], max_rows=1)[0]
+        return self.check(numbers[None], max_rows=1)[0]
 
     @property
     def about(self) -> str:
@@ -159,31 +159,35 @@ class ActionSpec:
 
         Raises `InputError` for a wrong shape, a value that is not finite or one out of bounds.
         """
-        found = to_numbers(rows)
-        if found.ndim != 2 or not 1 <= len(found) <= max_rows or found.shape[1] != len(self.names):
+        numbers = to_numbers(rows)
+        if (
+            numbers.ndim != 2
+            or not 1 <= len(numbers) <= max_rows
+            or numbers.shape[1] != len(self.names)
+        ):
             raise InputError(
-                f"The actions have shape {found.shape}: {self.about} must have 1 to {max_rows} "
+                f"The actions have shape {numbers.shape}: {self.about} must have 1 to {max_rows} "
                 f"rows of {len(self.names)} numbers."
             )
-        finite = np.isfinite(found)
+        finite = np.isfinite(numbers)
         if not finite.all():
             row, column = np.argwhere(~finite)[0].tolist()
             raise InputError(
-                f"Row {row} of the actions has {found[row, column]} as {self.names[column]}: all "
+                f"Row {row} of the actions has {numbers[row, column]} as {self.names[column]}: all "
                 "must be finite. Give a hand that is out of view its last place: it is hidden from "
                 "the model, and listed in hidden_hands."
             )
         low, high = self.bounds
         # float32 rounds some bounds outward
-        outside = (found < low - 1e-6) | (found > high + 1e-6)
+        outside = (numbers < low - 1e-6) | (numbers > high + 1e-6)
         if outside.any():
             row, column = np.argwhere(outside)[0].tolist()
             raise InputError(
-                f"Row {row} of the actions has {found[row, column]:.4g} as {self.names[column]}: "
+                f"Row {row} of the actions has {numbers[row, column]:.4g} as {self.names[column]}: "
                 f"it must be from {low[column]:.4g} to {high[column]:.4g}. Positions are in "
                 "meters in the world, rotations in radians."
             )
-        return found
+        return numbers
 
     def to_action(
         self,
@@ -247,12 +251,13 @@ class ActionSpec:
 
         Raises `InputError` for an unknown field or a wrong type.
         """
-        known = cls().to_json()
-        if unknown := sorted(fields.keys() - known.keys()):
+        defaults = cls().to_json()
+        if unknown := sorted(fields.keys() - defaults.keys()):
             raise InputError(
-                f"The actions have no setting {quote(unknown[0])}: choose from {', '.join(known)}."
+                f"The actions have no setting {quote(unknown[0])}: choose from "
+                f"{', '.join(defaults)}."
             )
-        given = {**known, **fields}
+        given = {**defaults, **fields}
         corners, reach, sides = given["workspace_m"], given["camera_reach"], given["sides"]
         shapes = _shape(corners) == (2, 3) and _shape(reach) == (2,)
         texts = isinstance(sides, list) and all(isinstance(side, str) for side in sides)

@@ -1,77 +1,71 @@
-"""Backends of environments and sessions: a model's world, or another one with its interface."""
+"""Backends of environments and sessions: the base of all, and a model's world."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import ClassVar
 
+from egosim_jax import configs
+from egosim_jax.generation.choose import preview_note
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.perception import registry
-from egosim_jax.simulation.simulator import (
-    Simulator,
-    UpdateEvery,
-    VideoGenerator,
-    chunk_frames,
-)
+from egosim_jax.simulation import preview
+from egosim_jax.simulation.preview import Preview
+from egosim_jax.simulation.simulator import Simulator, UpdateEvery
 from egosim_jax.simulation.start import Start
+from egosim_jax.simulation.streams import VideoGenerator, chunk_frames
 from egosim_jax.types import VideoSpec, check_seed
 from egosim_jax.worlds.tabletop import start_of_sequence
 
 
-@runtime_checkable
-class Backend(Protocol):
+@dataclass(frozen=True, kw_only=True)
+class Backend:
     """Environment backend: a world in which episodes are simulated."""
 
-    @property
-    def video(self) -> VideoSpec:
-        """Length, size and rate of the clips."""
-        ...
+    video: VideoSpec
+    """Length, size and rate of the clips."""
+
+    needs_past: ClassVar[bool] = False
+    """True if a simulator depends on all actions since the seed."""
 
     @property
     def chunk_frames(self) -> tuple[int, ...]:
         """Frames of each chunk of a clip; a world that makes clips at once has one chunk."""
-        ...
-
-    @property
-    def trained_on(self) -> str | None:
-        """Simulated world whose clips trained the model; None if unknown or without a model."""
-        ...
-
-    needs_past: ClassVar[bool]
-    """True if a simulator depends on all actions since the seed."""
+        return (self.video.frames,)
 
     def identity(self) -> dict[str, str]:
         """Return the settings that determine the clips; equal ones can resume a session."""
-        ...
+        raise NotImplementedError
 
     def start(self, seed: int, spec: ActionSpec) -> Start:
-        """Return the start of a seed's episode."""
-        ...
+        """Return the start of a seed's episode: the tabletop scene with its first camera."""
+        return tabletop_start(seed, spec, self.video)
+
+    def note(self, start: Start) -> str | None:
+        """Return what to know of the clips of a start, in one line, if there is something."""
+        return None
 
     def simulator(self, start: Start) -> Simulator:
         """Return the simulator of the clip that follows a start."""
-        ...
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
-class GeneratedWorld:
+class GeneratedWorld(Backend):
     """World of a video generator, with the scenes of the tabletop world."""
 
     generator: VideoGenerator
     """Generator of the clips, shared by all episodes; a `Batcher` generates them together."""
-    video: VideoSpec
-    """Length, size and rate of the generator's clips."""
     perception: str | None = "classical"
     """Perception that updates the state: name and options, or None to keep the first state."""
     trained_on: str | None = None
     """Simulated world whose clips trained the generator (`configs.trained_on`); None if unknown."""
-
+    previews_others: bool = False
+    """Previews of scenes that are not of `trained_on`, instead of the generator's clips."""
     update_every: UpdateEvery = "clip"
     """Update of the state after each clip, or after each chunk of a clip."""
-
-    needs_past: ClassVar[bool] = False
 
     @property
     def chunk_frames(self) -> tuple[int, ...]:
@@ -81,20 +75,37 @@ class GeneratedWorld:
     def identity(self) -> dict[str, str]:
         """Return the size of the clips, the perception, and the generator's content hash."""
         return {
-            "world": "generated",
+            "world": preview.NAME if self.makes_previews else "generated",
             "video": str(self.video),
             "perception": str(self.perception),
             "update_every": self.update_every,
             "generator": fingerprint(self.generator),
         }
 
-    def start(self, seed: int, spec: ActionSpec) -> Start:
-        """Return the seed's tabletop scene with its first camera."""
-        return tabletop_start(seed, spec, self.video)
+    @property
+    def makes_previews(self) -> bool:
+        """True if the generator is the preview."""
+        return isinstance(self.generator, Preview)
+
+    def note(self, start: Start) -> str | None:
+        """Return what to know of the clips of a start: previews, or weights not made for it."""
+        if self.makes_previews or self._instead(start):
+            return preview_note(instead=not self.makes_previews)
+        return configs.scene_warning(self.trained_on, start.state.provenance)
 
     def simulator(self, start: Start) -> Simulator:
-        """Return the simulator, the same one for all clips."""
-        return self._simulator
+        """Return the simulator of the clip that follows a start."""
+        return self._previews if self._instead(start) else self._simulator
+
+    def _instead(self, start: Start) -> bool:
+        """Return True if a start gets previews instead of the generator's clips."""
+        foreign = configs.scene_warning(self.trained_on, start.state.provenance) is not None
+        return foreign and self.previews_others
+
+    @cached_property
+    def _previews(self) -> Simulator:
+        renderer = self._simulator.renderer
+        return replace(self._simulator, generator=Preview(renderer=renderer))
 
     @cached_property
     def _simulator(self) -> Simulator:
@@ -120,9 +131,20 @@ def tabletop_start(seed: int, spec: ActionSpec, video: VideoSpec) -> Start:
     )
 
 
+def is_of_seed(start: Start) -> bool:
+    """Return True if the scene of a start is the tabletop scene of its seed, maybe changed."""
+    origin = start.state.provenance
+    return origin.get("world") == "tabletop" and origin.get("seed") == str(start.seed)
+
+
 def neutral_prompt(spec: ActionSpec) -> str:
     """Return a prompt that names no object and no goal: the policy alone decides what happens."""
     side, *others = spec.sides
     if spec.kind == "robot":
         return "The grippers move." if others else "The gripper moves."
     return "The hands move." if others else f"The {side} hand moves."
+
+
+def preview_info(generator: VideoGenerator) -> dict[str, bool]:
+    """Return what `info` says of a step's clip: that it is a preview, if it is one."""
+    return {preview.NAME: True} if isinstance(generator, Preview) else {}

@@ -10,56 +10,19 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property
 from queue import SimpleQueue
-from typing import Protocol, no_type_check, runtime_checkable
+from typing import Any, no_type_check
 
 import numpy as np
 from jaxtyping import UInt8
 
-from egosim_jax.rendering import Renderer
-from egosim_jax.simulation.simulator import ClipStream, VideoGenerator
+from egosim_jax.rendering import PriorKind
+from egosim_jax.simulation.streams import ClipStream, VideoGenerator, WholeClip
 from egosim_jax.types import Action, InputError, Triplet, View, check_counts, check_seed
-
-
-@runtime_checkable
-class BatchGenerator(VideoGenerator, Protocol):
-    """Generator of several clips in one program (`generation.generator.Generator`)."""
-
-    renderer: Renderer
-
-    @property
-    def point_px(self) -> int:
-        """Side of the points of a prior in pixels."""
-        ...
-
-    def condition(
-        self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"]
-    ) -> Triplet:
-        """Return the conditioning inputs of a clip."""
-        ...
-
-    def groups(
-        self, triplets: Sequence[Triplet], seeds: Sequence[int]
-    ) -> Iterator[UInt8[np.ndarray, "b g h w 3"]]:
-        """Yield the frames of one clip per triplet in groups, as they are decoded."""
-        ...
-
-    def fingerprint(self) -> str:
-        """Return the content hash of the config and weights."""
-        ...
-
-    @property
-    def chunk_frames(self) -> tuple[int, ...]:
-        """Frames of each chunk of a clip."""
-        ...
-
-    def begin(self, first_frame: UInt8[np.ndarray, "h w 3"], seed: int) -> ClipStream:
-        """Begin a clip whose conditions are given chunk by chunk."""
-        ...
 
 
 @no_type_check
@@ -85,19 +48,20 @@ class _Request:
 
     def receive(self) -> Iterator[UInt8[np.ndarray, "g h w 3"]]:
         """Yield the groups, in the caller's thread."""
-        while (found := self._groups.get()) is not None:
-            if isinstance(found, Exception):
-                raise found
-            yield found
+        while (group := self._groups.get()) is not None:
+            if isinstance(group, Exception):
+                raise group
+            yield group
 
 
 class Batcher:
-    """Generator that batches the clips of several threads (`simulator.StreamedGenerator`)."""
+    """Generator that batches the clips of several threads (`streams.StreamedGenerator`)."""
 
-    def __init__(
-        self, generator: BatchGenerator, *, max_batch: int = 8, unit: int = 1, wait_s: float = 0.05
-    ):
-        """Start the thread; `unit` is the number of mesh parts that share a batch."""
+    def __init__(self, generator: Any, *, max_batch: int = 8, unit: int = 1, wait_s: float = 0.05):
+        """Start the thread of a `generation.generator.Generator`, or of one with its methods.
+
+        `unit` is the number of mesh parts that share a batch.
+        """
         check_counts({"batch size": max_batch, "parts of the mesh": unit})
         if max_batch % unit:
             raise InputError(
@@ -106,6 +70,7 @@ class Batcher:
             )
         self.renderer = generator.renderer
         self.point_px = generator.point_px
+        self.prior: PriorKind = generator.prior
         self._generator = generator
         self.sizes = [unit]
         # powers of two keep the number of programs to compile small
@@ -138,7 +103,9 @@ class Batcher:
         return self._generator.chunk_frames
 
     def begin(self, first_frame: UInt8[np.ndarray, "h w 3"], seed: int) -> ClipStream:
-        """Begin a clip whose conditions are given chunk by chunk; it is not batched."""
+        """Begin a clip. A clip of several chunks, given one after the other, is not batched."""
+        if len(self.chunk_frames) == 1:
+            return WholeClip(self, first_frame, seed)
         return self._generator.begin(first_frame, seed)
 
     @contextmanager

@@ -7,8 +7,10 @@ model generates a fixed number of frames, so a shorter chunk is padded with its 
 from __future__ import annotations
 
 import time
+from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, no_type_check
+from typing import Any, cast, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -16,8 +18,9 @@ from jaxtyping import Bool, Float
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.batching import announced
 from egosim_jax.simulation.actions import check_action
-from egosim_jax.simulation.simulator import FrameTimer, Simulator, Step
+from egosim_jax.simulation.simulator import Phase, Simulator, Step
 from egosim_jax.simulation.start import Start
+from egosim_jax.simulation.streams import Latency
 from egosim_jax.state import snapshot
 from egosim_jax.types import Action, Cameras, SceneState, VideoSpec, View
 
@@ -51,7 +54,7 @@ class Timing:
     """Seconds of each phase of a step; all timings compare equal, so equal steps stay equal."""
 
     render_s: float = field(compare=False)
-    """Rendering of the state along the camera path."""
+    """Prediction of the motion, and rendering along the camera path."""
     generate_s: float = field(compare=False)
     """Generation of the clip, including the wait for its batch."""
     update_s: float = field(compare=False)
@@ -60,22 +63,6 @@ class Timing:
     """From the action to the first decoded frames."""
     last_frame_s: float = field(compare=False)
     """From the action to the last decoded frames."""
-
-    @classmethod
-    def of(cls, timer: FrameTimer, ended: float, rendered: float | None = None) -> Timing:
-        """Return the timing of a step by its frames, its end, and the end of its rendering.
-
-        Phases that alternate, chunk by chunk, count as generation.
-        """
-        first_s, last_s = timer.latency.first_frame_s, timer.latency.last_frame_s
-        render_s = 0.0 if rendered is None else rendered - timer.since
-        return cls(
-            render_s=render_s,
-            generate_s=last_s - render_s,
-            update_s=ended - timer.since - last_s,
-            first_frame_s=first_s,
-            last_frame_s=last_s,
-        )
 
 
 def make_chunk(
@@ -96,7 +83,7 @@ def make_chunk(
     before = spec.rest if start.row is None else start.row
     path = np.concatenate([before[None], given, np.repeat(given[-1:], padded, axis=0)])
     action, hidden = spec.to_action(path, camera=start.camera, prompt=prompt or start.prompt)
-    check_action(action, state=start.state, fps=video.fps, continued=True)
+    check_action(action, state=start.state, fps=video.fps, continued=True, any_hand=True)
     return Chunk(action=action, rows=path, padded=padded, hidden=hidden)
 
 
@@ -121,20 +108,28 @@ def timed_step(
     seed: int,
     first_frame: np.ndarray | None,
 ) -> tuple[Step, Timing]:
-    """Run one step of a simulator, and time its phases."""
-    timer = FrameTimer(simulator.show)
-    shown = replace(simulator, show=timer)
+    """Run one step of a simulator, and time its phases.
+
+    Updates of the state by chunk count as generation.
+    """
+    seconds: dict[Phase, float] = defaultdict(float)
+
+    def run(name: Phase, make: Callable[[], Any]) -> Any:
+        then = time.monotonic()
+        result = make()
+        seconds[name] += time.monotonic() - then
+        return result
+
     with announced(simulator.generator):  # before rendering, so that a batch waits for this clip
-        if simulator.update_every == "chunk":
-            step = shown.step(state, action, seed=seed, first_frame=first_frame)
-            return step, Timing.of(timer, time.monotonic())
-        view = shown.render(state, action)
-        rendered = time.monotonic()
-        clip = shown.generate(view, action, seed=seed, first_frame=first_frame)
-    after, notes = simulator.update(state, clip, action)
-    timing = Timing.of(timer, time.monotonic(), rendered)
-    step = Step(view=view, clip=clip, state=after, notes=notes, latency=timer.latency)
-    return step, timing
+        step = simulator.step(state, action, seed=seed, first_frame=first_frame, run=run)
+    render_s, latency = seconds["predict"] + seconds["render"], cast(Latency, step.latency)
+    return step, Timing(
+        render_s=render_s,
+        generate_s=seconds["generate"] - render_s,
+        update_s=seconds["perceive"] + seconds["fuse"],
+        first_frame_s=latency.first_frame_s,
+        last_frame_s=latency.last_frame_s,
+    )
 
 
 def state_info(state: SceneState) -> dict[str, Any]:

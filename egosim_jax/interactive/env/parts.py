@@ -17,8 +17,9 @@ from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import Backend
 from egosim_jax.interactive.env.chunks import Chunk, make_chunk
 from egosim_jax.simulation.actions import split_action
-from egosim_jax.simulation.simulator import Latency, OpenClip, Show, Step
+from egosim_jax.simulation.simulator import OpenClip, Step
 from egosim_jax.simulation.start import Start
+from egosim_jax.simulation.streams import Latency, Show
 from egosim_jax.types import InputError
 
 
@@ -100,7 +101,7 @@ class OpenStep:
         lengths = [counts[0] + 1, *counts[1:]] if not begun else [1, *counts]
         actions = split_action(chunk.action, lengths)[int(begun) :]
         taken = len(self._clip.latencies)
-        ahead = self._clip.simulator.update_every == "clip"
+        ahead = not self._clip.by_chunk
         frames = []
         for number, action in enumerate(actions):
             self._clip.put(action, show)

@@ -56,27 +56,18 @@ class RewardFn(Protocol):
 
 def check_object(first: SceneState, number: int) -> None:
     """Raise `InputError` unless the first state of an episode has points of an object."""
-    known = set(np.unique(first.object_ids).tolist()) - {0}
-    if number not in known:
+    objects = set(np.unique(first.object_ids).tolist()) - {0}
+    if number not in objects:
         raise InputError(
             f"Object {number} has no points in the first state: its position is unknown. Choose "
-            f"one of {sorted(known)[:100]}, the keys of info['objects']."
+            f"one of {sorted(objects)[:100]}, the keys of info['objects']."
         )
 
 
-@runtime_checkable
-class StartChecker(Protocol):
-    """Reward function that refuses an episode which it cannot judge, at its reset."""
-
-    def check(self, start: Start) -> None:
-        """Raise `InputError` unless the reward is defined in an episode from a start."""
-        ...
-
-
 def check_reward(reward: RewardFn, start: Start) -> None:
-    """Run the check of a reward function that has one."""
-    if isinstance(reward, StartChecker):
-        reward.check(start)
+    """Run the method `check` of a reward function that has one: it refuses a start."""
+    if (check := getattr(reward, "check", None)) is not None:
+        check(start)
 
 
 def check_callable(reward: Any) -> None:

@@ -14,9 +14,8 @@ import numpy as np
 from gymnasium import spaces
 from jaxtyping import Float, UInt8
 
-from egosim_jax import configs
 from egosim_jax.interactive.env.action_spec import ActionSpec
-from egosim_jax.interactive.env.backends import Backend
+from egosim_jax.interactive.env.backends import Backend, preview_info
 from egosim_jax.interactive.env.chunks import (
     OBSERVATIONS,
     STATE_FIELDS,
@@ -31,6 +30,7 @@ from egosim_jax.interactive.env.chunks import (
 from egosim_jax.interactive.env.parts import OpenStep, part_rows
 from egosim_jax.interactive.env.rewards import (
     Outcome,
+    Reward,
     RewardFn,
     check_callable,
     check_reward,
@@ -81,7 +81,7 @@ def observation_space(video: VideoSpec, spec: ActionSpec, observe: tuple[str, ..
     size = (video.height, video.width)
     low, high = spec.bounds
     keypoints = (len(spec.sides), 21 if spec.kind == "human" else 3, 3)
-    known = {
+    by_name = {
         "frames": spaces.Box(0, 255, (video.frames, *size, 3), np.uint8),
         "depth": spaces.Box(0, FAR_M, size, np.float32),
         "keypoints": spaces.Box(-FAR_M, FAR_M, keypoints, np.float64),
@@ -94,7 +94,7 @@ def observation_space(video: VideoSpec, spec: ActionSpec, observe: tuple[str, ..
         ),
     }
     row = spaces.Box(low, high, dtype=np.float64)
-    return spaces.Dict({"row": row, **{name: known[name] for name in observe}})
+    return spaces.Dict({"row": row, **{name: by_name[name] for name in observe}})
 
 
 def start_from_options(
@@ -169,11 +169,20 @@ def seed_of(seed: object) -> int | None:
 class RunningEpisode:
     """Episode in progress, with its position and last step."""
 
-    def __init__(self, backend: Backend, actions: ActionSpec, start: Start):
+    def __init__(
+        self,
+        backend: Backend,
+        actions: ActionSpec,
+        start: Start,
+        *,
+        reward: RewardFn,
+        max_chunks: int,
+    ):
         self.backend, self.actions, self.start, self.now = backend, actions, start, start
+        self._reward, self._max_chunks, self.ended = reward, max_chunks, False
         self.camera = start.camera
         self.last: Step | None = None
-        if note := configs.scene_warning(backend.trained_on, start.state.provenance):
+        if note := backend.note(start):
             warnings.warn(note, stacklevel=3)
 
     @property
@@ -213,19 +222,29 @@ class RunningEpisode:
     def facts(self, chunk: Chunk, step: Step) -> dict[str, Any]:
         """Return the metadata of a step of a chunk."""
         now = self.now
-        renderer = self.backend.simulator(now).renderer
+        simulator = self.backend.simulator(now)
         return {
             **chunk.info(self.actions),
+            **preview_info(simulator.generator),
             "notes": list(step.notes),
-            **validity(now.state, step, chunk.action, renderer),
+            **validity(now.state, step, chunk.action, simulator.renderer),
         }
 
-    def advance(self, chunk: Chunk, step: Step) -> dict[str, Any]:
-        """Move the episode past the step of a chunk; return `info`."""
+    def judged(self, step: Step) -> Reward:
+        """Return the reward of a step, without changing the episode."""
+        return judge(self._reward, Outcome(first=self.start.state, step=step))
+
+    def advance(
+        self, chunk: Chunk, step: Step, result: Reward, facts: dict[str, Any]
+    ) -> tuple[float, bool, bool, dict[str, Any]]:
+        """Move past the step of a chunk; return reward, termination, truncation and `info`."""
         kept = chunk.action if self.backend.needs_past else None
         self.last, self.now = step, self.now.after(step.state, chunk.rows[-1], kept)
         self.camera = last_camera(chunk.action)
-        return self.info()
+        truncated = self.chunks >= self._max_chunks and not result.terminated
+        self.ended = result.terminated or truncated
+        info = {**self.info(), **facts, "success": result.success}
+        return result.reward, result.terminated, truncated, info
 
     def info(self) -> dict[str, Any]:
         """Return the number of the last chunk, the hash of the state, and its objects."""
@@ -245,19 +264,19 @@ class RunningEpisode:
 
     def observation(self, observe: tuple[str, ...]) -> dict[str, Any]:
         """Return the row and the requested observations."""
-        found: dict[str, Any] = {"row": self.row.copy()}
+        seen: dict[str, Any] = {"row": self.row.copy()}
         if "frames" in observe:
-            found["frames"] = self.frames().copy()
+            seen["frames"] = self.frames().copy()
         if "depth" in observe:
-            found["depth"] = np.minimum(self._view().depth_m[0], np.float32(FAR_M))
+            seen["depth"] = np.minimum(self._view().depth_m[0], np.float32(FAR_M))
         if "keypoints" in observe:
-            found["keypoints"] = self.actions.joints(self.row[None])[0].copy()
+            seen["keypoints"] = self.actions.joints(self.row[None])[0].copy()
         if "state" in observe:
             state = self.now.state
             # a space has a fixed shape: sample evenly, with repeats in a small state
             chosen = np.linspace(0, len(state.points_m) - 1, STATE_POINTS).astype(int)
-            found["state"] = {name: getattr(state, name)[chosen] for name in STATE_FIELDS}
-        return found
+            seen["state"] = {name: getattr(state, name)[chosen] for name in STATE_FIELDS}
+        return seen
 
 
 class WorldEnv(gymnasium.Env):
@@ -291,7 +310,7 @@ class WorldEnv(gymnasium.Env):
         check_callable(reward)
         self._running: RunningEpisode | None = None
         self._open: OpenStep | None = None
-        self._ended = self._closed = False
+        self._closed = False
 
     @property
     def chunk(self) -> int:
@@ -321,7 +340,8 @@ class WorldEnv(gymnasium.Env):
         with show_phases(), phase("makes the scene", only_if_long=True):
             start = start_from_options(self.backend, self.actions, seed=chosen, options=options)
         check_reward(self._reward, start)
-        self._running, self._ended = RunningEpisode(self.backend, self.actions, start), False
+        limits = {"reward": self._reward, "max_chunks": self._max_chunks}
+        self._running = RunningEpisode(self.backend, self.actions, start, **limits)
         self._open = None
         return self.running.observation(self._observe), self.running.info()
 
@@ -368,14 +388,14 @@ class WorldEnv(gymnasium.Env):
             raise
         about = {"part": step.done, "timing": step.latency}
         if step.left:
-            found = running.observation(self._observe)
-            if "frames" in found:
+            seen = running.observation(self._observe)
+            if "frames" in seen:
                 missing = self.backend.video.frames - len(step.frames)
-                found["frames"] = np.pad(step.frames, ((0, missing), *[(0, 0)] * 3), mode="edge")
-            found["row"] = step.row.copy()
-            if "keypoints" in found:
-                found["keypoints"] = self.actions.joints(step.row[None])[0]
-            return found, 0.0, False, False, {**running.info(), **about}
+                seen["frames"] = np.pad(step.frames, ((0, missing), *[(0, 0)] * 3), mode="edge")
+            seen["row"] = step.row.copy()
+            if "keypoints" in seen:
+                seen["keypoints"] = self.actions.joints(step.row[None])[0]
+            return seen, 0.0, False, False, {**running.info(), **about}
         self._open = None
         chunk, made = step.finish()
         return self._advance(chunk, made, {**running.facts(chunk, made), **about})
@@ -383,21 +403,16 @@ class WorldEnv(gymnasium.Env):
     def _continued(self) -> RunningEpisode:
         """Return the episode. Raises `InputError` if it has ended."""
         self._check_open()
-        if self._ended:
+        if self.running.ended:
             raise InputError("The episode has ended: reset it before the next step.")
         return self.running
 
     def _advance(
-        self, chunk: Chunk, step: Step, known: dict[str, Any]
+        self, chunk: Chunk, step: Step, facts: dict[str, Any]
     ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Move the episode past a step, and return its result."""
-        running = self.running
-        result = judge(self._reward, Outcome(first=running.start.state, step=step))
-        info = {**running.advance(chunk, step), **known, "success": result.success}
-        truncated = running.chunks >= self._max_chunks and not result.terminated
-        self._ended = result.terminated or truncated
-        observation = running.observation(self._observe)
-        return observation, result.reward, result.terminated, truncated, info
+        outcome = self.running.advance(chunk, step, self.running.judged(step), facts)
+        return self.running.observation(self._observe), *outcome
 
     def _check_open(self) -> None:
         if self._closed:

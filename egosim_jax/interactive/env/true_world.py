@@ -13,8 +13,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import UInt8
 
-from egosim_jax.interactive.env.action_spec import ActionSpec
-from egosim_jax.interactive.env.backends import tabletop_start
+from egosim_jax.interactive.env.backends import Backend, is_of_seed
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.perception.oracle import OracleConfig
 from egosim_jax.rendering import jitted
@@ -28,10 +27,9 @@ from egosim_jax.types import (
     Kind,
     Perceived,
     SceneState,
-    VideoSpec,
     View,
 )
-from egosim_jax.worlds.tabletop import TabletopClip, World, start_of_sequence, to_ground_truth
+from egosim_jax.worlds.tabletop import TabletopClip, World, observation_of, start_of_sequence
 from egosim_jax.worlds.tabletop.clips import POINT_PX
 
 MAX_CACHED_WORLDS = 256
@@ -39,12 +37,10 @@ MAX_CACHED_WORLDS = 256
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrueWorld:
+class TrueWorld(Backend):
     """Backend that executes actions in the tabletop world and returns its ground truth."""
 
     needs_past: ClassVar[bool] = True
-    video: VideoSpec
-    """Length, size and rate of the clips."""
     _changing: threading.Lock = field(
         default_factory=threading.Lock, init=False, repr=False, compare=False
     )
@@ -52,36 +48,20 @@ class TrueWorld:
         default_factory=OrderedDict, init=False, repr=False, compare=False
     )
 
-    @property
-    def chunk_frames(self) -> tuple[int, ...]:
-        """Return one chunk: this world makes clips at once."""
-        return (self.video.frames,)
-
-    @property
-    def trained_on(self) -> None:
-        """Return None: this world has no model."""
-        return None
-
     def identity(self) -> dict[str, str]:
         """Return the size of the clips; nothing else varies."""
         return {"world": "true", "video": str(self.video)}
-
-    def start(self, seed: int, spec: ActionSpec) -> Start:
-        """Return the seed's scene with its first camera."""
-        return tabletop_start(seed, spec, self.video)
 
     def simulator(self, start: Start) -> Simulator:
         """Return the simulator of the clip after a start.
 
         Raises `InputError` unless the start has a seed's scene and all actions since the seed.
         """
-        origin = start.state.provenance
-        own = origin.get("world") == "tabletop" and origin.get("seed") == str(start.seed)
-        if not own or start.state.step != len(start.past):
+        if not is_of_seed(start) or start.state.step != len(start.past):
             raise InputError(
                 "The true world has only the scenes of its seeds, changed by known actions: it "
-                f"cannot begin from a state of {dict(origin)} at step {start.state.step} with "
-                f"{len(start.past)} known actions. Reset it with a seed."
+                f"cannot begin from a state of {dict(start.state.provenance)} at step "
+                f"{start.state.step} with {len(start.past)} known actions. Reset it with a seed."
             )
         execution = _Execution(world=self, start=start)
         return Simulator(
@@ -97,11 +77,11 @@ class TrueWorld:
         for action in start.past:  # a chained hash names each prefix of the episode
             key = hashlib.sha256(f"{key} {fingerprint(action)}".encode()).hexdigest()
             keys.append(key)
-        known, world = self._last_known(keys)
+        count, world = self._longest_cached(keys)
         if world is None:
             scene = start_of_sequence(start.seed, spec=self.video, kind=kind)[0]
             world = World(scene=scene, seed=start.seed)
-        for action in start.past[known:]:
+        for action in start.past[count:]:
             world = world.move(action, joints_m=places_of(action))[1]
         with self._changing:
             self._worlds[keys[-1]] = world
@@ -110,12 +90,12 @@ class TrueWorld:
                 self._worlds.popitem(last=False)
         return world
 
-    def _last_known(self, keys: Sequence[str]) -> tuple[int, World | None]:
+    def _longest_cached(self, keys: Sequence[str]) -> tuple[int, World | None]:
         """Return the longest cached prefix: its number of actions, and its world."""
         with self._changing:
-            for known in reversed(range(len(keys))):
-                if (world := self._worlds.get(keys[known])) is not None:
-                    return known, world
+            for count in reversed(range(len(keys))):
+                if (world := self._worlds.get(keys[count])) is not None:
+                    return count, world
         return 0, None
 
 
@@ -142,7 +122,7 @@ class _Execution:
 
 @dataclass(frozen=True, kw_only=True)
 class _TrueGenerator:
-    """Generator that returns the true frames (`simulator.VideoGenerator`)."""
+    """Generator that returns the true frames (`streams.VideoGenerator`)."""
 
     execution: _Execution
     renderer: ModuleType = jitted
@@ -161,5 +141,5 @@ class _TruePerception:
     execution: _Execution
 
     def __call__(self, clip: Clip, action: Action, state: SceneState) -> Perceived:
-        observation = to_ground_truth(self.execution.clip(action))
+        observation = observation_of(self.execution.clip(action))
         return OracleConfig().build({state.step: observation})(clip, action, state)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from egosim_jax.perception.silhouettes import HandShape, hand_silhouette
+from egosim_jax.perception.video.silhouettes import HandShape, hand_silhouette
 from egosim_jax.rendering import Renderer
 from egosim_jax.simulation.simulator import Step
 from egosim_jax.types import Action, SceneState, View
@@ -49,11 +49,11 @@ def validity(state: SceneState, step: Step, action: Action, renderer: Renderer) 
         pixels = seen & _without_outline(view.object_ids == number)
         if np.count_nonzero(pixels) >= MIN_OBJECT_PIXELS:
             shares[number] = float(agree[pixels].mean())
-    found = {"validity": float(steady.mean())} if steady.size else {}
+    figures = {"validity": float(steady.mean())} if steady.size else {}
     if shares:
         least = min(shares, key=shares.__getitem__)
-        found |= {"object_validity": shares[least], "least_valid_object": least}
-    return found
+        figures |= {"object_validity": shares[least], "least_valid_object": least}
+    return figures
 
 
 def steady_pixels(view: View, hands: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
@@ -66,13 +66,13 @@ def untouched(
 ) -> list[int]:
     """Return the ids of the objects that did not move, and that no hand came near."""
     joints = joints_m[np.isfinite(joints_m).all(axis=-1)]
-    found = []
+    still = []
     for number in np.unique(before.object_ids[before.object_ids > 0]).tolist():
         poses = [s.world_from_object.get(number, np.eye(4)) for s in (before, after)]
         points = before.points_m[before.object_ids == number]
         if np.allclose(*poses, atol=1e-6) and not _is_near(joints, points):
-            found.append(number)
-    return found
+            still.append(number)
+    return still
 
 
 def _is_near(joints_m: Float[np.ndarray, "k 3"], points_m: Float[np.ndarray, "m 3"]) -> bool:

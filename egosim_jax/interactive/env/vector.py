@@ -16,11 +16,9 @@ from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import Backend
 from egosim_jax.interactive.env.chunks import straight_path
 from egosim_jax.interactive.env.rewards import (
-    Outcome,
     RewardFn,
     check_callable,
     check_reward,
-    judge,
     no_reward,
 )
 from egosim_jax.interactive.env.single import (
@@ -88,7 +86,6 @@ class WorldVectorEnv(VectorEnv):
         self.single_observation_space = space
         self.observation_space = batch_space(space, num_envs)
         self._running: list[RunningEpisode | None] = [None] * num_envs
-        self._ended = np.zeros(num_envs, bool)
         self._threads = ThreadPoolExecutor(num_envs, thread_name_prefix="episode")
 
     @property
@@ -99,10 +96,10 @@ class WorldVectorEnv(VectorEnv):
     @property
     def running(self) -> list[RunningEpisode]:
         """Episodes in progress. Raises `InputError` before the first reset."""
-        found = [running for running in self._running if running is not None]
-        if len(found) < self.num_envs:
+        begun = [running for running in self._running if running is not None]
+        if len(begun) < self.num_envs:
             raise InputError("The environment has no episodes: call reset first.")
-        return found
+        return begun
 
     def reset(
         self,
@@ -139,8 +136,8 @@ class WorldVectorEnv(VectorEnv):
         for number, start in zip(chosen, begun, strict=True):
             check_reward(self._rewards[number], start)
         for number, start in zip(chosen, begun, strict=True):
-            self._running[number] = RunningEpisode(self.backend, self.actions, start)
-        self._ended[mask] = False
+            limits = {"reward": self._rewards[number], "max_chunks": self._max_chunks}
+            self._running[number] = RunningEpisode(self.backend, self.actions, start, **limits)
         with show_phases(), phase("draws the first observations", only_if_long=True):
             return self._observations(), self._infos([running.info() for running in self.running])
 
@@ -149,8 +146,7 @@ class WorldVectorEnv(VectorEnv):
         several = isinstance(seed, list | tuple) or (isinstance(seed, np.ndarray) and seed.ndim > 0)
         numbers: Iterable[Any] = cast(Iterable[Any], seed) if several else [seed]
         given = [seed_of(number) for number in numbers]
-        known = [number for number in given if number is not None]
-        super().reset(seed=known[0] if known else None)
+        super().reset(seed=next((number for number in given if number is not None), None))
         seeds = [int(self.np_random.integers(2**31)) if n is None else n for n in given]
         return seeds if several else [seeds[0] + number for number in range(self.num_envs)]
 
@@ -189,23 +185,18 @@ class WorldVectorEnv(VectorEnv):
                 for running, chunk in zip(self.running, chunks, strict=True)
             ]
             wait(made)  # all: a step that still runs must not outlive an error of another
-        steps, known = zip(*(future.result() for future in made), strict=True)
-        results = [
-            judge(reward, Outcome(first=running.start.state, step=step))
-            for running, reward, step in zip(self.running, self._rewards, steps, strict=True)
-        ]
-        infos = [
-            {**running.advance(chunk, step), **facts, "success": result.success}
-            for running, chunk, step, facts, result in zip(
-                self.running, chunks, steps, known, results, strict=True
+        steps, facts = zip(*(future.result() for future in made), strict=True)
+        # all are judged before any episode changes: a reward function may raise
+        results = [r.judged(step) for r, step in zip(self.running, steps, strict=True)]
+        outcomes = [
+            running.advance(chunk, step, result, of_step)
+            for running, chunk, step, result, of_step in zip(
+                self.running, chunks, steps, results, facts, strict=True
             )
         ]
-        rewards = np.array([result.reward for result in results])
-        terminated = np.array([result.terminated for result in results])
-        chunks_done = np.array([running.chunks for running in self.running])
-        truncated = (chunks_done >= self._max_chunks) & ~terminated
-        self._ended = terminated | truncated
-        return self._observations(), rewards, terminated, truncated, self._infos(infos)
+        rewards, terminated, truncated, infos = zip(*outcomes, strict=True)
+        flags = np.array(terminated), np.array(truncated)
+        return self._observations(), np.array(rewards), *flags, self._infos(infos)
 
     def _check_open(self) -> None:
         if self.closed:
@@ -219,23 +210,24 @@ class WorldVectorEnv(VectorEnv):
             raise InputError(
                 f"There are {given} actions for {self.num_envs} episodes: give one for each."
             )
-        if self._ended.any():
-            raise InputError(
-                f"Episode {int(np.argmax(self._ended))} has ended: reset it with the option "
-                "reset_mask before the next step."
-            )
+        for number, running in enumerate(self.running):
+            if running.ended:
+                raise InputError(
+                    f"Episode {number} has ended: reset it with the option reset_mask before the "
+                    "next step."
+                )
 
     def _observations(self) -> dict[str, Any]:
-        found = [running.observation(self._observe) for running in self.running]
+        seen = [running.observation(self._observe) for running in self.running]
         empty = create_empty_array(self.single_observation_space, self.num_envs)
-        batch: Any = concatenate(self.single_observation_space, found, empty)
+        batch: Any = concatenate(self.single_observation_space, seen, empty)
         return batch
 
     def _infos(self, infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
-        found: dict[str, Any] = {}
+        joined: dict[str, Any] = {}
         for number, info in enumerate(infos):
-            found = self._add_info(found, info, number)
-        return found
+            joined = self._add_info(joined, info, number)
+        return joined
 
     def close_extras(self, **kwargs: Any) -> None:
         """End the threads."""

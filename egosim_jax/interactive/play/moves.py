@@ -98,7 +98,7 @@ def drive(before: Pose, target: Pose, frames: int) -> list[Pose]:
 def perform(scene: Scene, intent: Intent, before: Pose, side: Side, frames: int) -> list[Pose]:
     """Return the hand's pose in each frame but the first of a scripted interaction."""
     hand = Hand(side=side, grip=before.grip())
-    moments = hand_motion.act(scene, (hand,), intent, "human", frames=frames)
+    moments = hand_motion.act(scene, (hand,), intent, "human", frames=frames, rises=True)
     return [Pose.of_grip(moment.hands[0].grip) for moment in moments[1:]]
 
 
@@ -151,12 +151,12 @@ def scene_from_state(scene: Scene, state: SceneState) -> Scene:
         motion = state.world_from_object.get(scene.instance_id(body.name))
         if motion is None:
             continue
-        part = motion @ scene.first_part_pose(body.name)
+        pose = motion @ scene.first_part_pose(body.name)
         if not body.articulated:
-            scene = scene.with_pose(body.name, part)
+            scene = scene.with_pose(body.name, pose)
             continue
         # estimated motion is noisy: take the nearest pose that the joint allows
-        inside = np.linalg.inv(body.world_from_body) @ part
+        inside = np.linalg.inv(body.world_from_body) @ pose
         gaps = [_gap(moving_part(body, opening), inside) for opening in OPENINGS]
         scene = scene.with_opening(body.name, float(OPENINGS[int(np.argmin(gaps))]))
     return scene

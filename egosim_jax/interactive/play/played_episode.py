@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
-from egosim_jax.interactive.env.backends import GeneratedWorld
+from egosim_jax.interactive.env.backends import GeneratedWorld, is_of_seed
 from egosim_jax.interactive.env.chunks import straight_path, view_of
 from egosim_jax.interactive.env.parts import part_rows
 from egosim_jax.interactive.play.moves import (
@@ -29,7 +29,7 @@ from egosim_jax.interactive.play.moves import (
     scene_from_state,
     suggest_goal,
 )
-from egosim_jax.interactive.server.parts import PartResult, Parts
+from egosim_jax.interactive.server.parts import Parts
 from egosim_jax.interactive.server.session import Result, Session
 from egosim_jax.rendering.mesh import Side
 from egosim_jax.simulation.actions import places_of
@@ -172,7 +172,7 @@ class PlayedEpisode:
 
         def make(number: int, shown: Callable[[Frames], None]) -> Result:
             row, target, planned = self.row, None, np.zeros((0, 0))
-            result: Result | PartResult | None = None
+            result: Result | None = None
             for part, count in enumerate(counts, start=1):
                 hand, camera = aim()
                 aimed = hand.row(self.side, camera)
@@ -235,7 +235,7 @@ class PlayedEpisode:
     ) -> Float[np.ndarray, "k d"]:
         """Return the rows of hand poses, in which the camera moves from a row to the given one."""
         cameras = straight_path(row[-6:], camera, len(poses) + 1)
-        rows = [pose.row(self.side, own) for pose, own in zip(poses, cameras, strict=True)]
+        rows = [pose.row(self.side, row) for pose, row in zip(poses, cameras, strict=True)]
         return np.clip(rows, *self.session.actions.bounds)
 
     def account(self) -> list[str]:
@@ -288,9 +288,7 @@ class PlayedEpisode:
 
 def _true_scene(start: Start, world: GeneratedWorld) -> Scene | None:
     """Return the tabletop scene of a start, or None if it does not come from a seed."""
-    origin = start.state.provenance
-    own = origin.get("world") == "tabletop" and origin.get("seed") == str(start.seed)
-    if not own or start.state.step:
+    if not is_of_seed(start) or start.state.step:
         return None
     return start_of_sequence(start.seed, spec=world.video)[0]
 

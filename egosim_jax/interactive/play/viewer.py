@@ -29,7 +29,7 @@ from egosim_jax.interactive.play.moves import (
 )
 from egosim_jax.interactive.play.played_episode import Frames, Moment, PlayedEpisode, Timing
 from egosim_jax.io.bounded import quote_text
-from egosim_jax.io.video import write_video
+from egosim_jax.io.writing import write_video
 from egosim_jax.types import InputError
 from egosim_jax.worlds.tabletop.bodies import REACH_M
 from egosim_jax.worlds.tabletop.hands import SKIN, hand_meshes, joints_of, pinch
@@ -140,7 +140,8 @@ class Page:
         gui.set_panel_label("egosim play")
         size = self.played.world.video.height, self.played.world.video.width
         blank = _large(np.zeros((*size, 3), np.uint8))
-        self._images = [gui.add_image(blank, label="Generated", jpeg_quality=90)]
+        label = "Preview, no model" if self.played.world.makes_previews else "Generated"
+        self._images = [gui.add_image(blank, label=label, jpeg_quality=90)]
         gui.add_markdown(HELP)
         self._status = gui.add_markdown("")
         with gui.add_folder("Act"):

@@ -7,11 +7,11 @@ Environments and their actions are in `env`, and the `egosim serve` command is i
 - `errors`: `RequestError`, the HTTP status, code and message of a refused request.
 - `requests`: fields of each request and their checks.
 - `session`: `Session`, the journaled steps of one world in a folder.
-- `store`: `Store` and `Limits`, all sessions and their bounded queue.
+- `parts`: steps whose rows are given part by part.
+- `store`: `Store`, all sessions and their bounded queue.
 - `service`: `Service`, from a request to its reply.
 - `server`: `make_app`, `bind`, `serve`, HTTP and websocket.
-- `guard`: `Guard`, checks of token, origin and size before a request is read.
-- `connections`: bounds on open connections.
+- `guard`: checks before a request is read: connections, token, origin, size and time.
 - `prometheus`: `Metrics`.
 - `replicas`: `app`, sessions on several machines by Ray Serve.
 - `dataset_export`: recorded sessions as LeRobot datasets, shards and Rerun recordings.

@@ -10,13 +10,14 @@ from typing import Any
 from egosim_jax.data.lerobot_writer import ClipRecord, EpisodeRecord, write_lerobot
 from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.shards import ShardWriter
-from egosim_jax.geometry import up_of
 from egosim_jax.interactive.env.backends import GeneratedWorld
 from egosim_jax.interactive.env.chunks import view_of
 from egosim_jax.interactive.server.session import CLOSED, DAMAGE, SETTINGS, Session, settings_of
 from egosim_jax.io.bounded import quote_path
 from egosim_jax.rendering import get
 from egosim_jax.rendering.rerun_log import Recording
+from egosim_jax.simulation import preview
+from egosim_jax.state.planes import vertical
 from egosim_jax.types import Action, InputError, SceneState, Triplet, VideoGrid, VideoSpec, View
 
 
@@ -40,14 +41,14 @@ def open_sessions(folder: Path, names: Sequence[str] = ()) -> tuple[list[Session
     `InputError` if no session is readable, and if a session of `names` is missing or damaged.
     """
     paths = sorted({p.parent for name in (SETTINGS, CLOSED) for p in folder.glob(f"[!.]*/{name}")})
-    known = {path.name: path for path in paths}
-    if missing := sorted(set(names) - set(known)):
+    by_name = {path.name: path for path in paths}
+    if missing := sorted(set(names) - set(by_name)):
         raise InputError(
-            f"{quote_path(folder)} has no session {missing[0][:40]!r}; it has {len(known)}: "
-            f"{', '.join(list(known)[:10]) or 'none'}. (--session)"
+            f"{quote_path(folder)} has no session {missing[0][:40]!r}; it has {len(by_name)}: "
+            f"{', '.join(list(by_name)[:10]) or 'none'}. (--session)"
         )
-    found, damaged = [], {}
-    for path in [known[name] for name in dict.fromkeys(names)] or paths:
+    readable, damaged = [], {}
+    for path in [by_name[name] for name in dict.fromkeys(names)] or paths:
         try:
             session = Session(path, _recorded(path))
             session.check()
@@ -58,30 +59,22 @@ def open_sessions(folder: Path, names: Sequence[str] = ()) -> tuple[list[Session
                 ) from error
             damaged[path.name] = str(error)
         else:
-            found += [session] if session.committed else []
-    if not found:
+            readable += [session] if session.committed else []
+    if not readable:
         raise InputError(
             f"{quote_path(folder)} has no readable session with a committed step"
             f"{f', and {len(damaged)} damaged ones' if damaged else ''}: give the folder of egosim "
             "serve. (SESSIONS)"
         )
-    return found, damaged
+    return readable, damaged
 
 
 def _recorded(path: Path) -> GeneratedWorld:
     """Return a world that renders a recorded session, and does not generate."""
     settings = settings_of(path)
-    fields, point_px = settings.get("video"), settings.get("point_px")
-    names = ("frames", "height", "width", "fps")
-    if (
-        not isinstance(fields, dict)
-        or not all(type(fields.get(n)) is int for n in names)
-        or type(point_px) is not int
-        or point_px < 1
-    ):
-        raise InputError(f"{quote_path(path)} does not describe a session's clips. Restore it.")
-    video = VideoSpec(**{name: fields[name] for name in names})
-    generator = _Unavailable(renderer=get("jax"), point_px=point_px)
+    fields = settings["video"]
+    video = VideoSpec(**{name: fields[name] for name in ("frames", "height", "width", "fps")})
+    generator = _Unavailable(renderer=get("jax"), point_px=int(settings["point_px"]))
     return GeneratedWorld(generator=generator, video=video, perception=None)
 
 
@@ -101,8 +94,19 @@ def to_lerobot(sessions: Sequence[Session], folder: Path) -> None:
     )
     kind = "gripper" if sessions[0].actions.kind == "robot" else "human_hands"
     write_lerobot(
-        folder, episodes, names=sessions[0].actions.names, fps=videos.pop().fps, robot_type=kind
+        folder,
+        episodes,
+        names=sessions[0].actions.names,
+        fps=videos.pop().fps,
+        robot_type=kind,
+        about={preview.NAME: True} if any(map(_has_previews, sessions)) else {},
     )
+
+
+def _has_previews(session: Session) -> bool:
+    """Return True if a clip of a session is a preview."""
+    numbers = [number for _, steps in session.runs() for number in steps]
+    return any(session.load_result(number).info.get(preview.NAME) for number in numbers)
 
 
 def _clips(session: Session, steps: Sequence[int]) -> Iterator[ClipRecord]:
@@ -158,8 +162,9 @@ def to_shards(sessions: Sequence[Session], folder: Path, *, grid: VideoGrid) -> 
 
 def to_rerun(session: Session, path: Path) -> None:
     """Write a recording of a session for the Rerun viewer (`egosim view`)."""
-    first = next(session.runs())[0].state
-    recording, state = Recording(path, session.id, up=up_of(first)), first
+    first = next(session.runs())[0]
+    up = vertical(first.state, first.camera.world_from_camera[0])
+    recording, state = Recording(path, session.id, up=up), first.state
     for number, before, view, _ in _steps(session):
         result = session.load_result(number)
         recording.add(

@@ -6,6 +6,7 @@ import errno
 import os
 from typing import Any
 
+from egosim_jax.runtime.command import system_error
 from egosim_jax.types import InputError
 
 STORAGE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES)
@@ -21,25 +22,8 @@ class RequestError(InputError):
 
     def body(self) -> dict[str, Any]:
         """Return the fields that the client receives."""
-        found = {"status": self.status, "code": self.code, "message": str(self)}
-        if self.retry_after_s is not None:
-            found["retry_after_s"] = self.retry_after_s
-        return found
-
-
-def storage_failure(error: BaseException) -> str | None:
-    """Return the system's reason if an error or its cause is that files cannot be written.
-
-    C++ libraries raise other errors, which have the system's reason in their text.
-    """
-    seen: BaseException | None = error
-    while seen is not None:
-        for code in STORAGE:
-            reason = os.strerror(code)
-            if (isinstance(seen, OSError) and seen.errno == code) or reason in str(seen):
-                return reason
-        seen = seen.__cause__ or seen.__context__
-    return None
+        body = {"status": self.status, "code": self.code, "message": str(self)}
+        return body if self.retry_after_s is None else body | {"retry_after_s": self.retry_after_s}
 
 
 def as_request_error(error: Exception) -> RequestError:
@@ -48,12 +32,13 @@ def as_request_error(error: Exception) -> RequestError:
         return error
     if isinstance(error, InputError):
         return RequestError(422, "invalid", str(error))
-    if (reason := storage_failure(error)) is not None:
+    if (failure := system_error(error)) is not None and failure[0] in STORAGE:
         return RequestError(
             507,
             "storage",
-            f"{reason} on the disk of the server's sessions, so the request was not done and the "
-            "session is as before. Send it again when the disk has space and can be written to.",
+            f"{os.strerror(failure[0])} on the disk of the server's sessions, so the request was "
+            "not done and the session is as before. Send it again when the disk has space and can "
+            "be written to.",
             retry_after_s=10.0,
         )
     if isinstance(error, FloatingPointError):

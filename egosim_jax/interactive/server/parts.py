@@ -9,33 +9,12 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import dataclass, field
-from typing import no_type_check
-
-import numpy as np
-from jaxtyping import UInt8
 
 from egosim_jax.interactive.env.parts import OpenStep
 from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.interactive.server.requests import request_hash
 from egosim_jax.interactive.server.session import Result, Session
-from egosim_jax.simulation.simulator import Latency, Show
-
-
-@no_type_check
-@dataclass(frozen=True, kw_only=True)
-class PartResult:
-    """Result of a part of a step, before the last one."""
-
-    step_id: int
-    """Number of the step."""
-    part: int
-    """Number of the part, from 1."""
-    frames: UInt8[np.ndarray, "f h w 3"]
-    """Frames of the part."""
-    row: np.ndarray
-    """Last row of hands and camera."""
-    latency: Latency
-    """Seconds from the rows to the frames."""
+from egosim_jax.simulation.streams import Show
 
 
 @dataclass
@@ -43,7 +22,7 @@ class _OpenParts:
     """Step of a session whose parts are being given."""
 
     step: OpenStep
-    results: list[PartResult] = field(default_factory=list)
+    results: list[Result] = field(default_factory=list)
     requests: list[str] = field(default_factory=list)
     """Hash of the request of each part."""
     since: float = field(default_factory=time.monotonic)
@@ -69,7 +48,7 @@ class Parts:
         rows: object,
         prompt: str | None,
         show: Show | None = None,
-    ) -> PartResult | Result:
+    ) -> Result:
         """Make the next part of a session's next step, or return the result of a part it has made.
 
         Part 1 begins the step again, unless it is repeated. The first part's prompt counts. Raises
@@ -77,14 +56,14 @@ class Parts:
         too many steps are open.
         """
         request = request_hash(rows, prompt, part)
-        if (known := session.committed_result(step_id, request)) is not None:
-            return known
-        found = self._open.get(session.id)
-        if found is not None and found.step.start is not session.now:
-            found = None  # a step, reset or load came between
-        done = 0 if found is None else len(found.results)
-        if found is not None and part <= done and found.requests[part - 1] == request:
-            return found.results[part - 1]
+        if (committed := session.committed_result(step_id, request)) is not None:
+            return committed
+        made = self._open.get(session.id)
+        if made is not None and made.step.start is not session.now:
+            made = None  # a step, reset or load came between
+        done = 0 if made is None else len(made.results)
+        if made is not None and part <= done and made.requests[part - 1] == request:
+            return made.results[part - 1]
         if part not in (1, done + 1):
             raise RequestError(
                 409,
@@ -92,26 +71,30 @@ class Parts:
                 f"Part {part} of step {step_id} cannot follow part {done}: parts are made once "
                 f"and in order. Send part {done + 1}, or begin the step again with part 1.",
             )
-        if found is None or part == 1:
-            found = self._begin(session, prompt)
+        if made is None or part == 1:
+            made = self._begin(session, prompt)
+        step, now = made.step, session.now
         try:
-            frames = found.step.step(rows, show)
+            frames = step.step(rows, show)
         except Exception:
-            self._close(session)  # no part can follow one that failed
+            self._open.pop(session.id, None)  # no part can follow one that failed
             raise
-        if not found.step.left:
-            self._close(session)
-            return session.commit(step_id, found.step.chunk(), request, frames=found.step.frames)
-        result = PartResult(
+        if not step.left:
+            self._open.pop(session.id, None)
+            return session.commit(step_id, step.chunk(), request, frames=step.frames)
+        result = Result(
             step_id=step_id,
-            part=part,
             frames=frames,
-            row=found.step.row,
-            latency=found.step.latency,
+            state=now.state,
+            row=step.row,
+            camera=now.camera,
+            info={},
+            part=part,
+            latency=step.latency,
         )
-        found.results.append(result)
-        found.requests.append(request)
-        found.since = time.monotonic()
+        made.results.append(result)
+        made.requests.append(request)
+        made.since = time.monotonic()
         return result
 
     def _begin(self, session: Session, prompt: str | None) -> _OpenParts:
@@ -131,9 +114,5 @@ class Parts:
                     retry_after_s=1.0,
                 )
             step = OpenStep(session.backend, session.actions, session.now, prompt)
-            found = self._open[session.id] = _OpenParts(step)
-        return found
-
-    def _close(self, session: Session) -> None:
-        with self._changing:
-            self._open.pop(session.id, None)
+            made = self._open[session.id] = _OpenParts(step)
+        return made

@@ -37,11 +37,11 @@ class Metrics:
 
     def refuse(self, error: Exception) -> RequestError:
         """Count an error and convert it for the client; log an internal one."""
-        found = as_request_error(error)
-        if found is not error and found.code == "internal":
+        refusal = as_request_error(error)
+        if refusal is not error and refusal.code == "internal":
             traceback.print_exception(error)
-        self.refused.labels(found.code).inc()
-        return found
+        self.refused.labels(refusal.code).inc()
+        return refusal
 
     def text(self) -> bytes:
         """Return the metrics in Prometheus's text format."""

@@ -12,10 +12,9 @@ import asyncio
 import json
 import socket
 import threading
-from collections.abc import AsyncGenerator
-from contextlib import AbstractContextManager, aclosing
+from contextlib import aclosing
 from importlib import metadata
-from typing import Annotated, Any, Protocol, runtime_checkable
+from typing import Annotated, Any
 
 import uvicorn
 from fastapi import Depends, FastAPI, Path, Request, Response, WebSocket, WebSocketDisconnect
@@ -23,18 +22,23 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, PlainTextResponse
 from starlette.exceptions import HTTPException
 
-from egosim_jax.interactive.origins import is_loopback
 from egosim_jax.interactive.server import wire
-from egosim_jax.interactive.server.connections import BoundedProtocol, BoundedWebsocket
 from egosim_jax.interactive.server.errors import RequestError
-from egosim_jax.interactive.server.guard import Guard, response, too_large, too_slow
-from egosim_jax.interactive.server.prometheus import Metrics
-from egosim_jax.interactive.server.service import Service
+from egosim_jax.interactive.server.guard import (
+    BoundedProtocol,
+    BoundedWebSocket,
+    Guard,
+    response,
+    too_large,
+)
+from egosim_jax.interactive.server.service import Requests, Service
 from egosim_jax.io.bounded import quote, quote_text
 from egosim_jax.types import InputError
 
 DRAIN_TIMEOUT_S = 300.0
 """Maximum time that a shutdown waits for running requests."""
+MAX_READ_BYTES = 2 * wire.MAX_BYTES
+"""Size up to which a too large message gets an error; above it uvicorn closes the websocket."""
 BODY = {
     "requestBody": {
         "description": "Fields of the request; see docs/protocol.md.",
@@ -44,34 +48,6 @@ BODY = {
 }
 """OpenAPI description of a body; FastAPI does not parse it, because `Guard` bounds its size."""
 SessionId = Annotated[str, Path(description="Id returned by create.")]
-
-
-@runtime_checkable
-class Requests(Protocol):
-    """Object that replies to clients: a `Service`, or an `Entrance` to several."""
-
-    metrics: Metrics
-    """Metrics of the requests."""
-
-    def problem(self) -> str:
-        """Return why no request is accepted now, or empty text."""
-        ...
-
-    async def describe(self) -> dict[str, Any]:
-        """Return the description that a client receives when it connects."""
-        ...
-
-    def active(self) -> AbstractContextManager[None]:
-        """Return the context that holds back a shutdown until the reply is sent."""
-        ...
-
-    async def handle(self, message: Any) -> dict[str, Any]:
-        """Return the reply to a request."""
-        ...
-
-    def replies(self, message: Any) -> AsyncGenerator[dict[str, Any], None]:
-        """Yield the reply to a request, after the frames of a streamed step."""
-        ...
 
 
 async def _fields(request: Request) -> dict[str, Any]:
@@ -101,9 +77,9 @@ def make_app(service: Requests, *, token: str | None = None) -> FastAPI:
 
     @app.exception_handler(RequestValidationError)
     async def invalid(_: Any, error: RequestValidationError) -> JSONResponse:
-        found = error.errors()[0]
-        place = quote_text(".".join(map(str, found["loc"])))
-        what = quote_text(str(found["msg"]))
+        first = error.errors()[0]
+        place = quote_text(".".join(map(str, first["loc"])))
+        what = quote_text(str(first["msg"]))
         return response(RequestError(422, "invalid", f"{place}: {what}. Correct it."))
 
     @app.exception_handler(InputError)
@@ -112,10 +88,6 @@ def make_app(service: Requests, *, token: str | None = None) -> FastAPI:
 
     @app.exception_handler(HTTPException)
     async def refused(_: Any, error: HTTPException) -> JSONResponse:
-        if error.status_code == 413:
-            return response(too_large())
-        if error.status_code == 408:
-            return response(too_slow())
         code = "unknown_path" if error.status_code in (404, 405) else "invalid"
         message = f"{error.detail}: /openapi.json lists the paths and methods of this server."
         return response(RequestError(error.status_code, code, message))
@@ -211,8 +183,13 @@ async def _converse(socket: WebSocket, service: Requests) -> None:
             message = await socket.receive()
             if message["type"] == "websocket.disconnect":
                 return
+            data = message.get("bytes")
+            if len(data or message.get("text") or "") > wire.MAX_BYTES:
+                await _refuse(socket, service, too_large())
+                await socket.close(1009)
+                return
             with service.active():
-                await _reply(socket, service, message.get("bytes"))
+                await _reply(socket, service, data)
     except (WebSocketDisconnect, RuntimeError):  # the client disconnected during a reply
         return
     finally:
@@ -225,7 +202,7 @@ async def _reply(socket: WebSocket, service: Requests, data: bytes | None) -> No
             raise InputError("The message is text: it must be binary, packed as MessagePack.")
         message = await asyncio.to_thread(wire.unpack, data, limit=wire.MAX_BYTES)
     except Exception as error:
-        await socket.send_text(json.dumps(service.metrics.refuse(error).body()))
+        await _refuse(socket, service, error)
         return
     async with aclosing(service.replies(message)) as replies:
         while True:
@@ -234,9 +211,13 @@ async def _reply(socket: WebSocket, service: Requests, data: bytes | None) -> No
             except StopAsyncIteration:
                 return
             except Exception as error:
-                await socket.send_text(json.dumps(service.metrics.refuse(error).body()))
+                await _refuse(socket, service, error)
                 return
             await socket.send_bytes(reply)
+
+
+async def _refuse(socket: WebSocket, service: Requests, error: Exception) -> None:
+    await socket.send_text(json.dumps(service.metrics.refuse(error).body()))
 
 
 class _Server(uvicorn.Server):
@@ -259,29 +240,6 @@ class _Server(uvicorn.Server):
         self.should_exit = True
 
 
-def bind(host: str, port: int, *, token: str | None) -> socket.socket:
-    """Bind a socket to an address; port 0 chooses a free one. `serve` then listens on it.
-
-    Raises `InputError` if the port is in use, and for a public address without a token.
-    """
-    if not is_loopback(host) and not token:
-        raise InputError(
-            f"{host} is reachable from other machines: the server needs a token to listen on it. "
-            "Set EGOSIM_TOKEN, or listen on 127.0.0.1. (--host)"
-        )
-    bound = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
-    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        bound.bind((host, port))
-    except OSError as error:
-        bound.close()
-        raise InputError(
-            f"Cannot listen on {host}:{port} ({error.strerror}): the address must belong to this "
-            "machine, and the port must be free. Choose another port, 0 for any free one. (--port)"
-        ) from error
-    return bound
-
-
 def serve(service: Service, bound: socket.socket, *, token: str | None, ready: Any = None) -> bool:
     """Serve until SIGTERM or Ctrl-C; call `ready` with the port once it listens.
 
@@ -293,8 +251,8 @@ def serve(service: Service, bound: socket.socket, *, token: str | None, ready: A
         access_log=False,
         http=BoundedProtocol,
         limit_concurrency=service.store.limits.connections + 1,
-        ws=BoundedWebsocket,
-        ws_max_size=wire.MAX_BYTES,
+        ws=BoundedWebSocket,
+        ws_max_size=MAX_READ_BYTES,
         ws_ping_interval=30.0,
         ws_ping_timeout=300.0,
         ws_per_message_deflate=False,

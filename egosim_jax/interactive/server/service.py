@@ -8,12 +8,11 @@ import threading
 import time
 from collections.abc import AsyncGenerator, Iterator, Mapping
 from concurrent.futures import Future
-from contextlib import contextmanager, suppress
-from dataclasses import asdict
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
@@ -22,8 +21,9 @@ from egosim_jax.interactive.env import World, load_backend
 from egosim_jax.interactive.env.action_spec import LAYOUTS
 from egosim_jax.interactive.env.chunks import OBSERVATIONS, STATE_FIELDS, view_of
 from egosim_jax.interactive.env.parts import part_rows
+from egosim_jax.interactive.options import Limits
 from egosim_jax.interactive.server.errors import RequestError
-from egosim_jax.interactive.server.parts import PartResult
+from egosim_jax.interactive.server.prometheus import Metrics
 from egosim_jax.interactive.server.requests import (
     REQUESTS,
     is_streamed,
@@ -31,31 +31,63 @@ from egosim_jax.interactive.server.requests import (
     parse_request,
 )
 from egosim_jax.interactive.server.session import Result, Session
-from egosim_jax.interactive.server.store import Limits, Store
+from egosim_jax.interactive.server.store import Store
 from egosim_jax.io.executables import share_with_jax
-from egosim_jax.runtime.memory import return_freed_blocks
-from egosim_jax.simulation.simulator import Latency
+from egosim_jax.runtime.processes import return_freed_blocks
 from egosim_jax.types import InputError
 
 T = TypeVar("T")
 
 
-class Service:
+async def last_of(replies: AsyncGenerator[dict[str, Any], None]) -> dict[str, Any]:
+    """Return the last of some replies, which is the reply to the request."""
+    return [reply async for reply in replies][-1]
+
+
+class Requests:
+    """Object that replies to clients: a `Service`, or an `Entrance` to several."""
+
+    def __init__(self, metrics: Metrics):
+        self.metrics = metrics
+
+    def problem(self) -> str:
+        """Return why no request is accepted now, or empty text."""
+        return ""
+
+    def active(self) -> AbstractContextManager[None]:
+        """Return the context that holds back a shutdown until the reply is sent."""
+        return nullcontext()
+
+    async def describe(self) -> dict[str, Any]:
+        """Return the description that a client receives when it connects."""
+        raise NotImplementedError
+
+    def replies(self, message: Any) -> AsyncGenerator[dict[str, Any], None]:
+        """Yield the reply to a request, after the frames of a streamed step."""
+        raise NotImplementedError
+
+    async def handle(self, message: Any) -> dict[str, Any]:
+        """Return the reply to a request. `Metrics.refuse` converts any error."""
+        if is_streamed(message):
+            raise InputError(
+                "stream is true, but this request has one reply: frames are streamed over the "
+                "websocket only. Connect there, or omit stream. (stream)"
+            )
+        return await last_of(self.replies(message))
+
+
+class Service(Requests):
     """Replies to the requests of clients, from the sessions of a store."""
 
     def __init__(self, store: Store, *, world: str):
-        self.store, self.metrics, self._world = store, store.metrics, world
+        super().__init__(store.metrics)
+        self.store, self._world = store, world
         self._active = 0
         self._quiet = threading.Condition()
 
-    @property
-    def draining(self) -> bool:
-        """True if the server is shutting down and accepts no new requests."""
-        return self.store.draining
-
     def problem(self) -> str:
         """Return why the server accepts no requests now, or empty text."""
-        return "draining" if self.draining else self.store.storage_problem()
+        return "draining" if self.store.draining else self.store.storage_problem()
 
     async def describe(self) -> dict[str, Any]:
         """Return the description that a client receives when it connects."""
@@ -74,7 +106,7 @@ class Service:
             "layouts": list(LAYOUTS),
             "observations": list(OBSERVATIONS),
             "requests": {name: list(fields) for name, fields in REQUESTS.items()},
-            "limits": asdict(limits),
+            "limits": limits.to_json(),
         }
 
     @contextmanager
@@ -95,16 +127,9 @@ class Service:
         with self._quiet:
             return self._quiet.wait_for(lambda: not self._active, timeout_s)
 
-    async def handle(self, message: Any) -> dict[str, Any]:
-        """Return the reply to a request. `Metrics.refuse` converts any error."""
-        name, request = parse_request(message)
-        if is_streamed(message):
-            raise InputError(
-                "stream is true, but this request has one reply: frames are streamed over the "
-                "websocket only. Connect there, or omit stream. (stream)"
-            )
-        observe = observations_of(request)
-        store = self.store
+    async def _reply_to(self, name: str, request: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the reply to a request that is not streamed."""
+        observe, store = observations_of(request), self.store
         if name == "status":
             return self.status(request)
         if name == "create":
@@ -121,7 +146,7 @@ class Service:
             return {"session": await self._wait(store.remove(request)), "closed": True}
         run = {"step": store.step, "reset": store.reset, "load": store.load}[name]
         result = await self._wait(run(request))
-        if name == "step" and not isinstance(result, PartResult):
+        if name == "step" and result.part is None:
             self.metrics.steps.inc()
         return await self._reply(session, result, observe)
 
@@ -130,11 +155,11 @@ class Service:
 
         A step that is already committed or running yields only the reply.
         """
+        name, request = parse_request(message)
         if not is_streamed(message):
-            yield await self.handle(message)
+            yield await self._reply_to(name, request)
             return
         then, times = time.monotonic(), []
-        request = parse_request(message)[1]
         observe = observations_of(request)
         groups: asyncio.Queue[UInt8[np.ndarray, "g h w 3"] | None] = asyncio.Queue()
         loop = asyncio.get_running_loop()
@@ -156,7 +181,7 @@ class Service:
             result = await made
         finally:
             made.cancel()  # the client disconnected; this ends the wait, not the step
-        if not isinstance(result, PartResult):
+        if result.part is None:
             self.metrics.steps.inc()
         reply = await self._reply(session, result, observe)
         if times:
@@ -177,7 +202,7 @@ class Service:
         return {
             "session": session.id,
             "committed_step_id": session.committed,
-            "busy": session.busy.locked(),
+            "busy": session.busy,
             "saved": session.saved,
             "actions": session.actions.to_json(),
             **session.result.info,
@@ -185,7 +210,7 @@ class Service:
 
     async def _wait(self, future: Future[T]) -> T:
         """Wait for a result; the work continues if the client disconnects or the wait times out."""
-        timeout = self.store.limits.step_timeout_s
+        timeout = self.store.limits.step_timeout
         waiting = asyncio.shield(asyncio.wrap_future(future))
         try:
             return await asyncio.wait_for(waiting, timeout)
@@ -199,59 +224,40 @@ class Service:
             ) from None
 
     async def _reply(
-        self, session: Session, result: Result | PartResult, observe: tuple[str, ...]
+        self, session: Session, result: Result, observe: tuple[str, ...]
     ) -> dict[str, Any]:
-        found: dict[str, Any] = {
+        reply: dict[str, Any] = {
             "session": session.id,
             "step_id": result.step_id,
             "row": result.row,
         }
         if "frames" in observe:
-            found["frames"] = result.frames
+            reply["frames"] = result.frames
         if "keypoints" in observe:
-            found["keypoints"] = session.actions.joints(result.row[None])[0]
-        if isinstance(result, PartResult):  # a part changes no state
-            return {**found, "part": result.part, "timing": _timing(result.latency)}
-        found["info"] = dict(result.info)
+            reply["keypoints"] = session.actions.joints(result.row[None])[0]
+        if (latency := result.latency) is not None:  # of a part, which changes no state
+            seconds = {"first_frames_s": latency.first_frame_s}
+            seconds["last_frames_s"] = latency.last_frame_s
+            return {**reply, "part": result.part, "timing": seconds}
+        reply["info"] = dict(result.info)
         if "state" in observe:
-            found["state"] = {name: getattr(result.state, name) for name in STATE_FIELDS}
+            reply["state"] = {name: getattr(result.state, name) for name in STATE_FIELDS}
         if "depth" in observe:
             simulator = session.backend.simulator(session.now)
             render = partial(view_of, simulator, result.state, result.camera)
             view = await self._wait(self.store.submit(render, bounded=False))
-            found["depth"] = np.asarray(view.depth_m[0])
-        return found
+            reply["depth"] = np.asarray(view.depth_m[0])
+        return reply
 
 
-def _timing(latency: Latency) -> dict[str, float]:
-    """Return the latency of frames as the replies have it."""
-    return {"first_frames_s": latency.first_frame_s, "last_frames_s": latency.last_frame_s}
+def open_service(folder: Path, limits: Limits, world: World, **options: Any) -> Service:
+    """Load and compile a world, resume the sessions of a folder, and return the service.
 
-
-def open_service(
-    folder: Path,
-    limits: Limits,
-    *,
-    world: World,
-    config: str,
-    weights: Path | None,
-    perception: str,
-    steps: int | None,
-    batch: int,
-    update_every: Literal["clip", "chunk"] = "clip",
-) -> Service:
-    """Load and compile a world, resume the sessions of a folder, and return the service."""
+    `load_backend` has the same options.
+    """
     share_with_jax()
     return_freed_blocks()
-    backend = load_backend(
-        world,
-        config=config,
-        weights=weights,
-        perception=perception,
-        steps=steps,
-        batch=batch,
-        update_every=update_every,
-    )
+    backend = load_backend(world, **options)
     store = Store(folder, backend, limits)
     print(f"resumed {len(store.sessions)} sessions", file=sys.stderr)
-    return Service(store, world=world)
+    return Service(store, world=backend.identity()["world"])

@@ -3,9 +3,8 @@
     session.json              settings; renamed closed.json if the session is closed and kept
     starts/N/                 start after committed step N, if a reset or load replaced it there
     starts/first/             first start, if a reset before step 1 replaced starts/0
-    steps/N/request.json      row of each frame, prompt, and hash of the request
-    steps/N/action.npz        cameras and joints; with both files, the step is accepted
-    steps/N/action_hands.npz  joints of all hands, if one is out of view
+    steps/N/request.json      row of each frame, prompt, and hash of the request; with this file,
+                              the step is accepted
     steps/N/rollout/          journal, clip and state (rollout.py)
     steps/N/info.json         metadata of the step; with this file, the step is committed
     saved/NAME/               starts that the client saved
@@ -18,7 +17,6 @@ removed, and the session stays at the step before.
 from __future__ import annotations
 
 import shutil
-import threading
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import nullcontext
@@ -29,28 +27,28 @@ from typing import Any, no_type_check
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from egosim_jax import configs
 from egosim_jax.interactive.env.action_spec import ActionSpec
-from egosim_jax.interactive.env.backends import Backend
+from egosim_jax.interactive.env.backends import Backend, preview_info
 from egosim_jax.interactive.env.batching import announced
 from egosim_jax.interactive.env.chunks import Chunk, last_camera, make_chunk, state_info, view_of
 from egosim_jax.interactive.env.validity import validity
 from egosim_jax.interactive.server import wire
 from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.interactive.server.requests import request_hash
+from egosim_jax.io.atomic import atomic_folder
 from egosim_jax.io.bounded import quote, quote_path, read_json
-from egosim_jax.io.run import write_json
-from egosim_jax.simulation.actions import load_placed, save_placed
+from egosim_jax.io.digest import fingerprint
+from egosim_jax.io.journal import Journal
+from egosim_jax.io.run import plain, write_json
 from egosim_jax.simulation.rollout import RecordedClip, Rollout, load_clip
-from egosim_jax.simulation.simulator import Show
 from egosim_jax.simulation.start import Start
+from egosim_jax.simulation.streams import Latency, Show
 from egosim_jax.state import snapshot
 from egosim_jax.types import Action, Cameras, InputError, SceneState
 
 SETTINGS, CLOSED = "session.json", "closed.json"
-INFO, REQUEST, ACTION = "info.json", "request.json", "action"
-ACTION_FILE = f"{ACTION}.npz"
-FIRST = "first"
+INFO, REQUEST = "info.json", "request.json"
+FIRST, SEAL = "first", "sha256"
 DAMAGE = (InputError, OSError, ValueError, KeyError, TypeError, IndexError)
 """Errors that reading a damaged session can raise."""
 
@@ -58,12 +56,12 @@ DAMAGE = (InputError, OSError, ValueError, KeyError, TypeError, IndexError)
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """Result of a session's last step or reset."""
+    """Result of a session's last step or reset, or of a part of its next step."""
 
     step_id: int
-    """Number of the last committed step."""
+    """Number of the last committed step; of a part, its step."""
     frames: UInt8[np.ndarray, "f h w 3"]
-    """Frames of the clip; after a reset only the first frame."""
+    """Frames of the clip, or of the part; after a reset only the first frame."""
     state: SceneState
     """State after the step."""
     row: np.ndarray
@@ -72,6 +70,10 @@ class Result:
     """Camera of the last frame."""
     info: Mapping[str, Any]
     """Metadata of the step: hash of the state, padded frames, validity and more."""
+    part: int | None = None
+    """Number of the part before the last one, from 1; it changes no state and has no `info`."""
+    latency: Latency | None = None
+    """Seconds from the rows of a part to its frames."""
 
 
 class Session:
@@ -82,9 +84,8 @@ class Session:
         self.folder, self.backend = folder, backend
         self.id = folder.name
         self.actions = ActionSpec.from_json(settings_of(folder)["actions"])
-        self.busy = threading.Lock()
-        self.in_flight: tuple[tuple[int, str], Future[Any]] | None = None
-        """Number and request hash of the running step, and its future result."""
+        self.running: tuple[tuple[int, str] | None, Future[Any]] | None = None
+        """Last request that changes the session: number and hash of its step, and its result."""
         steps = [int(p.name) for p in (folder / "steps").glob("[0-9]*")]
         self.committed = max((n for n in steps if self._is_committed(n)), default=0)
         self._last: Result | None = None
@@ -92,7 +93,7 @@ class Session:
 
     @classmethod
     def create(cls, folder: Path, backend: Backend, actions: ActionSpec, start: Start) -> Session:
-        """Write and open a new session; after an error the folder is removed."""
+        """Write and open a new session, complete or absent."""
         settings = {
             "actions": actions.to_json(),
             "video": backend.video,
@@ -100,19 +101,24 @@ class Session:
             "seed": start.seed,
             "world": backend.identity(),
         }
+        with atomic_folder(folder) as temporary:
+            start.save(temporary / "starts" / "0")
+            _write_sealed(temporary / SETTINGS, settings)
         try:
-            start.save(folder / "starts" / "0")
-            write_json(folder / SETTINGS, settings)
             return cls(folder, backend)
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
 
     @property
+    def busy(self) -> bool:
+        """Return True while a request changes the session."""
+        return self.running is not None and not self.running[1].done()
+
+    @property
     def pending(self) -> bool:
         """Return True if the request of the next step is on disk."""
-        folder = self._step(self.committed + 1)
-        return all((folder / name).exists() for name in (REQUEST, ACTION_FILE))
+        return (self._step(self.committed + 1) / REQUEST).exists()
 
     def _step(self, number: int) -> Path:
         return self.folder / "steps" / str(number)
@@ -123,7 +129,7 @@ class Session:
     def _drop(self, number: int) -> None:
         """Remove a step."""
         # these files first: after a crash here, no half of the step can be resumed
-        for name in (INFO, ACTION_FILE):
+        for name in (INFO, REQUEST):
             (self._step(number) / name).unlink(missing_ok=True)
         shutil.rmtree(self._step(number), ignore_errors=True)
 
@@ -140,10 +146,11 @@ class Session:
             now = Start.load(chosen)
             return now, self._reset_result(now)
         base = self._starts()[-1]
+        self.now = start = Start.load(self._start(base))  # it has the camera of the actions
         past: tuple[Action, ...] = ()
         if self.backend.needs_past:
             past = tuple(self.action(n) for n in range(base + 1, self.committed + 1))
-        result, start = self.load_result(self.committed), Start.load(self._start(base))
+        result = self.load_result(self.committed)
         now = replace(
             start,
             state=result.state,
@@ -163,7 +170,7 @@ class Session:
         if image is None:
             image = view_of(simulator, start.state, start.camera).frames[0]
         info = self._state_info(start.state, self.committed)
-        if note := configs.scene_warning(self.backend.trained_on, start.state.provenance):
+        if note := self.backend.note(start):
             info["scene_warning"] = note
         return Result(
             step_id=self.committed,
@@ -179,15 +186,11 @@ class Session:
         return {"chunk": number, **wire.to_json(state_info(state))}
 
     def action(self, number: int) -> Action:
-        """Return the action of an accepted step."""
-        request = self._request(number)
-        return load_placed(
-            self._step(number),
-            ACTION,
-            kind=self.actions.kind,
-            size=(self.backend.video.height, self.backend.video.width),
-            prompt=request["prompt"],
-        )
+        """Return the action of an accepted step, which follows from its rows."""
+        latest = number > self._starts()[-1]
+        camera = self.now.camera if latest else Start.load(self._base(number)).camera
+        prompt = self._request(number)["prompt"]
+        return self.actions.to_action(self.rows(number), camera=camera, prompt=prompt)[0]
 
     def hash_of(self, number: int) -> str:
         """Return the request hash of an accepted step."""
@@ -196,16 +199,18 @@ class Session:
     def _request(self, number: int) -> dict[str, Any]:
         """Return the request of a step. Raises `InputError` if it is damaged."""
         path = self._step(number) / REQUEST
-        found = read_json(path)
-        if not isinstance(found, dict) or not found.keys() >= {"prompt", "request", "rows"}:
+        request = _read_sealed(path)
+        if not request.keys() >= {"prompt", "request", "rows"}:
             raise InputError(f"{quote_path(path)} does not describe a step's request. Restore it.")
-        return found
+        return request
 
     def load_result(self, number: int) -> Result:
         """Read the result of a committed step."""
         folder, action = self._step(number), self.action(number)
         request, clip = self._request(number), folder / "rollout" / "clip_1"
         info = read_json(folder / INFO)
+        if not isinstance(info, dict):
+            raise InputError(f"{quote_path(folder / INFO)} does not describe a step. Restore it.")
         state = clip / "state"
         return Result(
             step_id=number,
@@ -230,8 +235,8 @@ class Session:
         and for another action under a used number.
         """
         request = request_hash(rows, prompt)
-        if (known := self.committed_result(step_id, request)) is not None:
-            return known
+        if (result := self.committed_result(step_id, request)) is not None:
+            return result
         video = self.backend.video
         chunk = make_chunk(self.actions, rows, start=self.now, video=video, prompt=prompt)
         return self.commit(step_id, chunk, request, show)
@@ -281,7 +286,6 @@ class Session:
         return last if last is not None and last.step_id == step_id else self.load_result(step_id)
 
     def _accept(self, number: int, chunk: Chunk, request: str) -> None:
-        folder = self._step(number)
         self._drop(number)
         fields = {
             "prompt": chunk.action.prompt,
@@ -289,8 +293,7 @@ class Session:
             "request": request,
             **chunk.info(self.actions),
         }
-        write_json(folder / REQUEST, fields)
-        save_placed(folder, ACTION, chunk.action)
+        _write_sealed(self._step(number) / REQUEST, fields)
 
     def finish(
         self, show: Show | None = None, frames: UInt8[np.ndarray, "f h w 3"] | None = None
@@ -327,6 +330,7 @@ class Session:
             "padded_frames": request["padded_frames"],
             "hidden_hands": request["hidden_hands"],
             "notes": list(step.notes),
+            **preview_info(generator),
             **wire.to_json(validity(now.state, step, action, simulator.renderer)),
         }
         row = np.array(request["rows"][-1], float)
@@ -386,12 +390,17 @@ class Session:
                 yield Start.load(self._start(base)), list(range(base + 1, end + 1))
 
     def check(self) -> None:
-        """Read all files that an export needs. Raises an error of `DAMAGE`."""
+        """Read all files that an export needs, and compare them. Raises an error of `DAMAGE`."""
+        video = self.backend.video
+        shape = (video.frames, video.height, video.width, 3)
         for start, steps in self.runs():
             self.backend.simulator(start)
             for number in steps:
-                self.load_result(number)
-                self.rows(number)
+                made = self._step(number) / "rollout"
+                Journal(made).verify("1 generate", made / "clip_1" / "frames.npz")
+                self.actions.check(self.rows(number), max_rows=video.frames)
+                if (found := self.load_result(number).frames.shape) != shape:
+                    raise InputError(f"the frames of step {number} are {found}, not {shape}.")
 
     def rows(self, number: int) -> Float[np.ndarray, "f d"]:
         """Return the row of each frame of a committed step."""
@@ -401,12 +410,27 @@ class Session:
 def settings_of(folder: Path) -> dict[str, Any]:
     """Return the settings of a session's folder. Raises `InputError` if they are damaged."""
     path = folder / (SETTINGS if (folder / SETTINGS).exists() else CLOSED)
-    settings = read_json(path)
-    if not isinstance(settings, dict) or not all(
-        isinstance(settings.get(name), dict) for name in ("actions", "world")
-    ):
+    settings = _read_sealed(path)
+    if not all(isinstance(settings.get(name), dict) for name in ("actions", "video", "world")):
         raise InputError(f"{quote_path(path)} does not describe a session. Restore it.")
     return settings
+
+
+def _write_sealed(path: Path, fields: Mapping[str, Any]) -> None:
+    """Write a JSON file with the hash of its fields."""
+    fields = plain(fields)
+    write_json(path, {**fields, SEAL: fingerprint(fields)})
+
+
+def _read_sealed(path: Path) -> dict[str, Any]:
+    """Return the fields of a sealed JSON file. Raises `InputError` if they were changed."""
+    fields = read_json(path)
+    if not isinstance(fields, dict) or fields.pop(SEAL, None) != fingerprint(fields):
+        raise InputError(
+            f"{quote_path(path)} was changed after it was written, or is of another version. "
+            "Restore it."
+        )
+    return fields
 
 
 def check_world(folder: Path, backend: Backend) -> None:

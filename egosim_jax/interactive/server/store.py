@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import re
 import secrets
 import shutil
 import sys
@@ -20,9 +19,9 @@ from typing import Any, TypeVar
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import Backend
+from egosim_jax.interactive.options import Limits
 from egosim_jax.interactive.server.errors import RequestError, as_request_error
-from egosim_jax.interactive.server.limits import Limits
-from egosim_jax.interactive.server.parts import PartResult, Parts
+from egosim_jax.interactive.server.parts import Parts
 from egosim_jax.interactive.server.prometheus import Metrics
 from egosim_jax.interactive.server.requests import (
     check_integer,
@@ -44,13 +43,11 @@ from egosim_jax.io.atomic import atomic_write, lock_folder
 from egosim_jax.io.bounded import quote, quote_path
 from egosim_jax.runtime.terminal import printable
 from egosim_jax.simulation.episode import Episode
-from egosim_jax.simulation.simulator import Show
 from egosim_jax.simulation.start import Start, check_size
+from egosim_jax.simulation.streams import Show
 from egosim_jax.types import InputError
 
 T = TypeVar("T")
-UNFINISHED = re.compile(r"starts|\.session\..*")
-"""File names that a crash can leave while a session is created."""
 MAX_SEED = 2**63 - 1_000_000
 """Maximum seed of a session: the seed of a step is larger by up to the number of steps."""
 MIN_FREE_BYTES = 4 << 20
@@ -67,11 +64,10 @@ class Store:
     def __init__(self, folder: Path, backend: Backend, limits: Limits):
         self.folder, self.backend, self.limits = folder, backend, limits
         self.metrics = Metrics()
-        self.parts = Parts(most=limits.open_steps, idle_s=limits.step_timeout_s)
+        self.parts = Parts(most=limits.open_steps, idle_s=limits.step_timeout)
         self.sessions: dict[str, Session] = {}
         self.damaged: dict[str, str] = {}
         self.draining = False
-        self._storage_failed = False
         self._reserved: set[str] = set()
         self._changing = threading.Lock()
         self._queued = 0
@@ -84,7 +80,7 @@ class Store:
         """Open all sessions of the folder, and finish interrupted steps."""
         for path in self.folder.glob(REMOVED.format("*")):
             shutil.rmtree(path, ignore_errors=True)
-        for path in sorted(self.folder.glob(f"*/{SETTINGS}")):
+        for path in sorted(self.folder.glob(f"[!.]*/{SETTINGS}")):
             try:
                 check_world(path.parent, self.backend)
                 session = Session(path.parent, self.backend)
@@ -97,7 +93,7 @@ class Store:
                 continue
             self.sessions[session.id] = session
             if key is not None:
-                session.in_flight = key, self.submit(session.finish, changes=session, bounded=False)
+                self.submit(session.finish, changes=session, key=key, bounded=False)
         self.metrics.sessions.set(len(self.sessions))
 
     def close(self, *, at_once: bool = False) -> None:
@@ -152,10 +148,7 @@ class Store:
                     retry_after_s=5.0,
                 )
             folder = self.folder / name
-            taken = name in self.sessions or name in self._reserved
-            if not taken and folder.is_dir() and _is_unfinished(folder):
-                shutil.rmtree(folder)
-            if taken or folder.exists():
+            if name in self.sessions or name in self._reserved or folder.exists():
                 raise RequestError(
                     409,
                     "session_exists",
@@ -190,9 +183,7 @@ class Store:
         check_size(start, self.backend.video)
         return start if prompt is None else replace(start, prompt=prompt)
 
-    def step(
-        self, request: Mapping[str, Any], show: Show | None = None
-    ) -> Future[Result | PartResult]:
+    def step(self, request: Mapping[str, Any], show: Show | None = None) -> Future[Result]:
         """Queue a step of a session or, if the request has one, a part of it.
 
         `show` gets the frames of a new step only.
@@ -204,30 +195,27 @@ class Store:
                 f"step_id is {step_id}: it must be one more than the last committed step. Send "
                 f"{session.committed + 1}."
             )
-        if step_id > self.limits.steps:
+        if step_id > self.limits.max_steps:
             raise RequestError(
                 429,
                 "too_many_steps",
-                f"Step {step_id} is more than a session's maximum of {self.limits.steps} steps: "
-                "create a new session.",
+                f"Step {step_id} is more than a session's maximum of {self.limits.max_steps} "
+                "steps: create a new session.",
             )
         if "actions" not in request:
             raise InputError("The step has no actions: give rows of numbers.")
         rows, part = request["actions"], part_of(request)
-        flight = session.in_flight
         key = step_id, request_hash(rows, prompt, part)
-        if flight is not None and flight[0] == key and not flight[1].done():
-            return flight[1]  # a client that reconnected waits for its running step
-        run: Callable[[], Result | PartResult]
+        if session.busy and (running := session.running) is not None and running[0] == key:
+            return running[1]  # a client that reconnected waits for its running step
+        run: Callable[[], Result]
         if part is None:
             run = partial(session.step, step_id, rows, prompt, show)
         else:
             run = partial(self.parts.step, session, step_id, part, rows, prompt, show)
         if step_id <= session.committed:  # a repeated step only reads, so it may run concurrently
             return self.submit(run)
-        future = self.submit(run, changes=session)
-        session.in_flight = key, future
-        return future
+        return self.submit(run, changes=session, key=key)
 
     def reset(self, request: Mapping[str, Any]) -> Future[Result]:
         """Queue a reset of a session to a seed or episode, by default to its first start."""
@@ -299,12 +287,14 @@ class Store:
         run: Callable[[], T],
         *,
         changes: Session | None = None,
+        key: tuple[int, str] | None = None,
         bounded: bool = True,
     ) -> Future[T]:
         """Run a request in a worker thread.
 
         A `bounded` request is refused if the queue is full or the server is shutting down. A
-        request that `changes` a session is refused while another one changes it.
+        request that `changes` a session is refused while another one changes it; `key` is the
+        number and hash of its step.
         """
         if bounded:
             self._check_open()
@@ -317,7 +307,7 @@ class Store:
                     f"{self.limits.queue}. Send it again later.",
                     retry_after_s=1.0,
                 )
-            if changes is not None and not changes.busy.acquire(blocking=False):
+            if changes is not None and changes.busy:
                 raise RequestError(
                     409,
                     "session_busy",
@@ -326,46 +316,39 @@ class Store:
                     retry_after_s=0.5,
                 )
             if changes is not None and self.sessions.get(changes.id) is not changes:
-                changes.busy.release()  # closed between lookup and lock
-                raise _unknown(changes.id)
+                raise _unknown(changes.id)  # closed between lookup and lock
             self._queued += 1
             self.metrics.queued.set(self._queued)
-        return self._threads.submit(self._run, run, changes)
+            future = self._threads.submit(self._run, run)
+            if changes is not None:
+                changes.running = key, future
+        return future
 
-    def _run(self, run: Callable[[], T], changes: Session | None) -> T:
+    def _run(self, run: Callable[[], T]) -> T:
         then = time.monotonic()
         try:
             return run()
         except Exception as error:
-            found = as_request_error(self._for_client(error))
-            if found.code == "internal":
+            refusal = as_request_error(self._for_client(error))
+            if refusal.code == "internal":
                 traceback.print_exc()
-            if found.code == "storage":
-                self._storage_failed = True
-                print(f"cannot write to {self.folder}: {found}", file=sys.stderr, flush=True)
-            raise found from error
+            if refusal.code == "storage":
+                print(f"cannot write to {self.folder}: {refusal}", file=sys.stderr, flush=True)
+            raise refusal from error
         finally:
-            if changes is not None:
-                changes.in_flight = None
-                changes.busy.release()
             with self._changing:
                 self._queued -= 1
                 self.metrics.queued.set(self._queued)
             self.metrics.seconds.observe(time.monotonic() - then)
 
     def storage_problem(self) -> str:
-        """Return why the folder takes no more data, or empty text.
-
-        After a request that could not be written, a file is written to know when it is possible.
-        """
+        """Return why the folder takes no more data, or empty text; a small file is written."""
         try:
             if shutil.disk_usage(self.folder).free < MIN_FREE_BYTES:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            if self._storage_failed:
-                with atomic_write(self.folder / PROBE) as temporary:
-                    temporary.write_bytes(bytes(MIN_FREE_BYTES))
-                (self.folder / PROBE).unlink()
-                self._storage_failed = False
+                return os.strerror(errno.ENOSPC)
+            with atomic_write(self.folder / PROBE) as temporary:
+                temporary.touch()
+            (self.folder / PROBE).unlink(missing_ok=True)
         except OSError as error:
             return error.strerror or str(error)
         return ""
@@ -395,7 +378,3 @@ def _unknown(session_id: object) -> RequestError:
         f"There is no session {quote(session_id)}: session must be the id of an open session, as "
         "returned by create. Create one.",
     )
-
-
-def _is_unfinished(folder: Path) -> bool:
-    return all(UNFINISHED.fullmatch(path.name) for path in folder.iterdir())

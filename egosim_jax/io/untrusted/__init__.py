@@ -5,8 +5,9 @@ and lines are read by `egosim_jax.io.bounded`.
 
 - isolated: read_file, which runs a reader in a child process with limits of memory and time
 - hdf5, parquet, colmap: read_hdf5, read_parquet, read_model, each in that child process
+- mjcf: check_files of MuJoCo models, which are compiled in that child process
 - npz: read_arrays of an npz, read_npy
 - pickled, pickled_arrays, pickled_models: interpreter of pickles, NumPy arrays, MANO's models
 - zipped: entries of zip archives, bounded by what they expand to
-- pth, torch_zip: tensors of PyTorch's files
+- pth: tensors of PyTorch's files
 """

@@ -23,8 +23,6 @@ from egosim_jax.io.bounded import open_regular, quote, quote_path, quote_text
 from egosim_jax.io.untrusted.isolated import read_file
 from egosim_jax.types import InputError
 
-MAX_FILE_BYTES = 1 << 31
-"""Largest file in bytes."""
 MAX_BYTES = 1 << 27
 """Maximum size of the datasets that are read of a file, in bytes, unpacked."""
 MAX_TEXTS = 1000
@@ -38,7 +36,7 @@ Shape = tuple[int | None, ...]
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Hdf5Contents:
-    """Arrays and texts that were read of an HDF5 file."""
+    """Arrays and string attributes read from an HDF5 file."""
 
     arrays: Mapping[str, Float64[np.ndarray, ...]]
     """Arrays of the file by their path in it."""
@@ -55,8 +53,9 @@ def read_hdf5(
 ) -> Hdf5Contents:
     """Read arrays of numbers and attributes of text of an HDF5 file.
 
-    `arrays` gives the shapes of required arrays. Raises `InputError` for arrays that are missing,
-    of another shape, not in the file itself, too large or damaged.
+    `arrays` gives the shapes of required arrays. Optional ones of another shape are omitted, as if
+    they were missing. Raises `InputError` for arrays that are missing, of another shape, not in the
+    file itself, too large or damaged.
     """
     return read_file(_read, path, arrays, optional or {}, texts)
 
@@ -65,7 +64,8 @@ def _read(
     path: Path, arrays: Mapping[str, Shape], optional: Mapping[str, Shape], texts: Sequence[str]
 ) -> Hdf5Contents:
     with _open(path) as file:
-        wanted = {**arrays, **{name: optional[name] for name in optional if file.has(name)}}
+        given = {name: shape for name, shape in optional.items() if file.has(name, shape)}
+        wanted = {**arrays, **given}
         return Hdf5Contents(
             arrays={name: file.array(name, shape) for name, shape in wanted.items()},
             texts={name: file.texts(name) for name in texts},
@@ -84,16 +84,9 @@ class _Hdf5:
         Raises `InputError` if it is missing, of another shape or not of numbers, too large, or not
         stored in the file itself.
         """
-        dataset = self._resolve(path)
-        have: tuple[int, ...] = getattr(dataset, "shape", None) or ()
-        fits = len(have) == len(shape)
-        if not fits or any(w not in (None, h) for h, w in zip(have, shape, strict=True)):
-            wanted = tuple("any" if size is None else size for size in shape)
-            raise InputError(f"{self.name}: {path} has shape {have}; expected {wanted}.")
-        if dataset.dtype.kind not in "iuf":
-            raise InputError(f"{self.name}: {path} holds {dataset.dtype}; expected numbers.")
+        dataset = self._find(path, shape)
         # The library unpacks a chunk whole, also of a dataset that is smaller.
-        sizes = max(math.prod(have), math.prod(dataset.chunks or ()))
+        sizes = max(math.prod(dataset.shape), math.prod(dataset.chunks or ()))
         self._bytes += sizes * max(8, dataset.dtype.itemsize)
         if self._bytes > MAX_BYTES:
             raise InputError(
@@ -103,13 +96,25 @@ class _Hdf5:
         self._check_storage(dataset, path)
         return np.asarray(dataset[()], np.float64)
 
-    def has(self, path: str) -> bool:
-        """Return True if a group or dataset exists in the file itself."""
+    def has(self, path: str, shape: Shape) -> bool:
+        """Return True if numbers of a shape exist in the file itself."""
         try:
-            self._resolve(path)
+            self._find(path, shape)
         except InputError:
             return False
         return True
+
+    def _find(self, path: str, shape: Shape) -> Any:
+        """Return a dataset of numbers of a shape."""
+        dataset = self._resolve(path)
+        have: tuple[int, ...] = getattr(dataset, "shape", None) or ()
+        fits = len(have) == len(shape)
+        if not fits or any(w not in (None, h) for h, w in zip(have, shape, strict=True)):
+            wanted = tuple("any" if size is None else size for size in shape)
+            raise InputError(f"{self.name}: {path} has shape {have}; expected {wanted}.")
+        if dataset.dtype.kind not in "iuf":
+            raise InputError(f"{self.name}: {path} holds {dataset.dtype}; expected numbers.")
+        return dataset
 
     def texts(self, name: str) -> tuple[str, ...]:
         """Return the texts of an attribute of the file, none if it is absent or not text."""
@@ -151,9 +156,6 @@ def _open(path: Path) -> Iterator[_Hdf5]:
 
     name = quote_path(path)
     with open_regular(path) as file:
-        size = file.seek(0, 2)
-        if size > MAX_FILE_BYTES:
-            raise InputError(f"{name} has {size:,} bytes, more than {MAX_FILE_BYTES:,}, the most.")
         try:
             with h5py.File(file, "r") as opened:
                 yield _Hdf5(opened, name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import struct
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from egosim_jax.types import InputError
 
 MAX_ARRAY_BYTES, MAX_PACKED_BYTES = 1 << 34, 1 << 26
 """Maximum size of a stored and of a compressed array, in bytes."""
-DAMAGE = (ValueError, EOFError, OSError)
+DAMAGE = (ValueError, EOFError, OSError, struct.error)
 """Exceptions for damaged archives and arrays."""
 MAX_ENTRIES = 64
 """Maximum number of arrays in a file."""

@@ -12,8 +12,6 @@ from egosim_jax.io.bounded import open_regular, quote_path, quote_text
 from egosim_jax.io.untrusted.isolated import read_file
 from egosim_jax.types import InputError
 
-MAX_FILE_BYTES = 1 << 32
-"""Largest file in bytes."""
 MAX_COLUMN_BYTES = 1 << 26
 """Largest size of the columns that are read, in bytes, unpacked."""
 MAX_VALUES = 1 << 23
@@ -43,8 +41,6 @@ def _read(
 
     name = quote_path(path)
     with open_regular(path) as file:
-        if file.seek(0, 2) > MAX_FILE_BYTES:
-            raise InputError(f"{name} has more than {MAX_FILE_BYTES:,} bytes, the most.")
         try:
             opened = pq.ParquetFile(file)
             found = opened.schema_arrow.names

@@ -1,4 +1,4 @@
-"""Read and write PyTorch's `.pth` files without PyTorch and without executing their pickles.
+"""Read PyTorch's `.pth` files without PyTorch and without executing their pickles.
 
 Our own code, because the only other reader, `torch.load`, needs PyTorch, which is no dependency.
 
@@ -12,15 +12,13 @@ from __future__ import annotations
 
 import math
 import struct
-import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.bounded import quote, quote_path, quote_text
 from egosim_jax.io.mapped import (
     CODES,
@@ -32,7 +30,7 @@ from egosim_jax.io.mapped import (
     strides_of,
 )
 from egosim_jax.io.untrusted.pickled import Interpreter, Name, Opaque, flatten
-from egosim_jax.io.untrusted.torch_zip import read_entries
+from egosim_jax.io.untrusted.zipped import Archive
 from egosim_jax.types import InputError
 
 STORAGES = {
@@ -75,34 +73,37 @@ def read_pth(path: Path) -> dict[str, Tensor]:
         ) from error
 
 
-def write_pth(path: Path, array: np.ndarray) -> None:
-    """Write one tensor atomically, as `torch.save` does, for `torch.load(weights_only=True)`."""
-    kinds = {dtype: kind for kind, dtype in STORAGES.items()}
-    kind, array = kinds[array.dtype.name], np.ascontiguousarray(array)
-    strides = [step // array.dtype.itemsize for step in array.strides]
-    storage = b"(" + _text("storage") + f"ctorch\n{kind}\n".encode() + _text("0") + _text("cpu")
-    storage += _number(array.size) + b"tQ"
-    ordered = b"ccollections\nOrderedDict\n)R"
-    arguments = storage + _number(0) + _numbers(array.shape) + _numbers(strides) + b"\x89" + ordered
-    program = b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n(" + arguments + b"tR."
-    entries = {
-        "data.pkl": program, "byteorder": b"little", "data/0": array.tobytes(), "version": b"3\n",
-    }  # fmt: skip
-    with atomic_write(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        for name, content in entries.items():
-            archive.writestr(zipfile.ZipInfo(f"archive/{name}"), content)
+def read_entries(data: memoryview) -> dict[str, memoryview]:
+    """Return the content of every entry by name, without the top-level folder.
 
-
-def _text(value: str) -> bytes:
-    return b"X" + struct.pack("<I", len(value)) + value.encode()
-
-
-def _number(value: int) -> bytes:
-    return b"\x8a\x08" + struct.pack("<q", value)
-
-
-def _numbers(values: Iterable[int]) -> bytes:
-    return b"(" + b"".join(map(_number, values)) + b"t"
+    Raises `RefusedError` if this is not a valid uncompressed little-endian archive.
+    """
+    if bytes(data[:2]) != b"PK":
+        raise RefusedError(
+            "not a zip archive; files from before torch 1.6 and bare pickles are not supported"
+        )
+    try:
+        archive = Archive(lambda at, count: bytes(data[at : at + count]), len(data))
+    except ValueError as error:
+        raise RefusedError(str(error)) from error
+    if sum(entry.size for entry in archive.entries.values()) > len(data):
+        raise RefusedError("its entries exceed the file")
+    found: dict[str, memoryview] = {}
+    for entry in archive.entries.values():
+        parts = entry.name.split("/")
+        if ".." in parts or entry.name.startswith("/") or "\\" in entry.name:
+            raise RefusedError(f"entry {quote(entry.name)} has a path outside the archive")
+        if not entry.is_stored:
+            raise RefusedError(f"entry {quote(entry.name)} is compressed or encrypted")
+        name = "/".join(parts[1:])
+        if name in found:
+            raise RefusedError(f"duplicate entry {quote(entry.name)}")
+        found[name] = data[entry.begin : entry.begin + entry.size]
+    if found.get("byteorder", b"little") != b"little":
+        raise RefusedError("its byte order is big-endian")
+    if "data.pkl" not in found:
+        raise RefusedError("it has no data.pkl")
+    return found
 
 
 class _Torch(Interpreter):

@@ -24,10 +24,10 @@ MAX_UNPACKED_BYTES = 1 << 28
 """Maximum size of a compressed entry in bytes, unpacked."""
 END, END64_LOCATOR = struct.Struct("<10xH4xI2x"), struct.Struct("<8xQ4x")
 END64, LOCAL = struct.Struct("<32xQ8xQ"), struct.Struct("<26xHH")
-CENTRAL = struct.Struct("<8xHH4xIIIHHH8xI")
-"""Fields of the zip records: end of directory (32 and 64 bits), local and central headers."""
-STORED, DEFLATED, ZIP64 = 0, 8, 0xFFFFFFFF
-"""Methods of entries, and the 32-bit value that refers to a 64-bit number."""
+CENTRAL, FIELD = struct.Struct("<8xHH4xIIIHHH8xI"), struct.Struct("<HH")
+"""Layouts of the end records (32 and 64 bits), local and central headers and extra fields."""
+STORED, DEFLATED, ZIP64, ZIP64_KIND = 0, 8, 0xFFFFFFFF, 1
+"""Methods of entries; the 32-bit value that refers to a 64-bit number, and that number's field."""
 
 Read = Callable[[int, int], bytes]
 """Function that reads a number of bytes at an offset; fewer at the end of the archive."""
@@ -129,10 +129,7 @@ def _directory(read: Read, size: int, max_entries: int) -> Iterator[tuple[Entry,
         place += CENTRAL.size + named + extra + comment
         if len(rest) != named + extra or place > size:
             raise ValueError("its directory is damaged")
-        numbers = _zip64_numbers(rest[named:])
-        full = next(numbers, full) if full == ZIP64 else full
-        packed = next(numbers, packed) if packed == ZIP64 else packed
-        header = next(numbers, header) if header == ZIP64 else header
+        full, packed, header = _widen((full, packed, header), rest[named:])
         name = rest[:named].decode("utf-8" if flags & 0x800 else "cp437", "replace")
         if method not in (STORED, DEFLATED) or flags & 1:
             raise ValueError(f"entry {quote(name)} is encrypted, or compressed by another method")
@@ -147,10 +144,19 @@ def _directory(read: Read, size: int, max_entries: int) -> Iterator[tuple[Entry,
         yield Entry(name, begin, packed, full, crc, method == STORED), header
 
 
-def _zip64_numbers(extra: bytes) -> Iterator[int]:
-    """Yield the 64-bit numbers in the extra field of an entry."""
-    while len(extra) >= 4:
-        kind, size = struct.unpack_from("<HH", extra)
-        if kind == 1:
-            yield from (number for (number,) in struct.iter_unpack("<Q", extra[4 : 4 + size & ~7]))
-        extra = extra[4 + size :]
+def _widen(numbers: tuple[int, ...], extra: bytes) -> tuple[int, ...]:
+    """Return the numbers of an entry, those over 32 bits from its ZIP64 field.
+
+    The field has only the numbers whose place refers to it, in order. Without a field, the number
+    itself is meant. Raises `ValueError` if a field is cut.
+    """
+    while len(extra) >= FIELD.size:
+        kind, size = FIELD.unpack_from(extra)
+        field, extra = extra[FIELD.size : FIELD.size + size], extra[FIELD.size + size :]
+        needed = struct.Struct(f"<{numbers.count(ZIP64)}Q")
+        if len(field) < size or (kind == ZIP64_KIND and size < needed.size):
+            raise ValueError("its directory is damaged: an extra field is cut")
+        if kind == ZIP64_KIND:
+            wide = iter(needed.unpack_from(field))
+            return tuple(next(wide) if number == ZIP64 else number for number in numbers)
+    return numbers

@@ -36,7 +36,7 @@ from egosim_jax.models.cogvideox.vae_layers import (
     causal_conv,
     fit,
 )
-from egosim_jax.models.conv import Conv
+from egosim_jax.models.conv import Conv, check_video
 from egosim_jax.models.layers import Linear
 from egosim_jax.types import InputError, check_counts
 
@@ -273,7 +273,8 @@ class CogVideoXVAE(nnx.Module):
         Raises `InputError` unless the video has floats (in [-1, 1]) and 8k+1 frames with a height
         and width in multiples of 8.
         """
-        self._check(video)
+        config = self.config
+        check_video(video, stride=config.spatial_stride, check_frames=config.check_frames)
         size = CHUNK * self.config.temporal_stride
         hidden = _by_chunk(self.encoder, video, first=size + 1, size=size)
         mean, logvar = jnp.split(hidden.astype(jnp.float32), 2, axis=-1)
@@ -328,21 +329,6 @@ class CogVideoXVAE(nnx.Module):
                 readers += [layer.scale, layer.shift]
         for layer in readers:
             layer.kernel[...] = size[:, None] * layer.kernel[...]
-
-    def _check(self, video: Array) -> None:
-        if not jnp.issubdtype(video.dtype, jnp.floating):
-            raise InputError(
-                f"A video of {video.dtype} cannot be encoded: values must be floats from -1 to 1. "
-                "For uint8 frames: frames / 127.5 - 1."
-            )
-        _, frames, height, width, _ = video.shape
-        space = self.config.spatial_stride
-        self.config.check_frames(frames)
-        if height % space or width % space:
-            raise InputError(
-                f"A video of {height} x {width} pixels cannot be encoded: rows and columns must "
-                f"be multiples of {space}. Resize or crop it."
-            )
 
 
 def _by_chunk(net: Encoder | Decoder, x: Array, *, first: int, size: int) -> Array:

@@ -26,7 +26,7 @@ from einops import rearrange
 from flax import nnx
 from jaxtyping import Array, Float
 
-from egosim_jax.models.conv import Conv
+from egosim_jax.models.conv import Conv, check_video
 from egosim_jax.models.layers import Linear
 from egosim_jax.models.wan.vae_layers import (
     Cache,
@@ -305,16 +305,6 @@ class WanVAE(nnx.Module):
         decode.kernel[...] = std[:, None] * decode.kernel[...]
 
     def _check(self, video: Array) -> None:
-        if not jnp.issubdtype(video.dtype, jnp.floating):
-            raise InputError(
-                f"A video of {video.dtype} cannot be encoded: values must be floats from -1 to 1. "
-                "For uint8 frames: frames / 127.5 - 1."
-            )
-        _, frames, height, width, _ = video.shape
         time, space = self.config.temporal_stride, self.config.spatial_stride
-        VideoGrid(temporal_stride=time, spatial_stride=space, patch=1).check_frames(frames)
-        if height % space or width % space:
-            raise InputError(
-                f"A video of {height} x {width} pixels cannot be encoded: rows and columns must "
-                f"be multiples of {space}. Resize or crop it."
-            )
+        grid = VideoGrid(temporal_stride=time, spatial_stride=space, patch=1)
+        check_video(video, stride=space, check_frames=grid.check_frames)

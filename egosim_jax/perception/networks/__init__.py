@@ -1,12 +1,12 @@
 """Networks of perception, each in a worker process, so the calling process never imports torch.
 
 Methods without weights do not belong here. Each module has both sides of one network: a frozen
-dataclass of its parameters, which satisfies a Protocol of `perception.estimates`, and a function
+dataclass of its parameters, which satisfies a Protocol of `video.estimates`, and a function
 `load`, which runs in the worker and may import torch or jax. A network's `fingerprint` contains the
 SHA-256 of its files but not their path: a run resumes if the folder has moved, and does not resume
 with other weights.
 
-    DepthAnything, DepthPro, DepthAnything3, DepthFiles:                depth
+    DepthAnything, DepthPro, DepthAnything3:                            depth
     DepthAnything3Cameras:                                              cameras
     GroundedSam2, GroundedSam3, GroundedEdgeTam, GroundingDino, Sam3:   masks and boxes
     Qwen3VL:                                                            captions
@@ -19,7 +19,6 @@ with other weights.
 
 from egosim_jax.perception.networks.depth_anything import DepthAnything
 from egosim_jax.perception.networks.depth_anything_3 import DepthAnything3, DepthAnything3Cameras
-from egosim_jax.perception.networks.depth_files import DepthFiles
 from egosim_jax.perception.networks.depth_pro import DepthPro
 from egosim_jax.perception.networks.grounded import GroundedEdgeTam, GroundedSam2, GroundedSam3
 from egosim_jax.perception.networks.grounding_dino import GroundingDino
@@ -32,7 +31,6 @@ __all__ = [
     "DepthAnything",
     "DepthAnything3",
     "DepthAnything3Cameras",
-    "DepthFiles",
     "DepthPro",
     "GroundedEdgeTam",
     "GroundedSam2",

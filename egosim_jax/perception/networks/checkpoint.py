@@ -18,7 +18,7 @@ import numpy as np
 from egosim_jax.io.bounded import quote, quote_path, read_json
 from egosim_jax.io.digest import fingerprint, sha256
 from egosim_jax.perception.networks.worker import worker_of
-from egosim_jax.types import InputError
+from egosim_jax.types import Counted, InputError
 
 DType = Literal["float32", "bfloat16", "float16"]
 CONFIG, WEIGHTS, INDEX = "config.json", "model.safetensors", "model.safetensors.index.json"
@@ -27,7 +27,7 @@ NOT_CONTENT = ("folder", "device", "timeout_s")
 
 
 @dataclass(frozen=True)
-class Network:
+class Network(Counted):
     """Network in a worker process, loaded from a local folder on first use."""
 
     needs: ClassVar[str]
@@ -53,6 +53,7 @@ class Network:
 
     def __post_init__(self) -> None:
         """Check that the folder is a checkpoint of this network."""
+        super().__post_init__()
         if self.timeout_s <= 0:
             raise InputError(f"timeout_s must be positive, not {self.timeout_s}. (--timeout-s)")
         self.check_config(self._read_config())
@@ -66,10 +67,10 @@ class Network:
 
     def check_config(self, config: Mapping[str, Any]) -> None:
         """Raise `InputError` if config.json belongs to another network."""
-        found = config.get("model_type")
-        if found not in self.model_types:
+        model_type = config.get("model_type")
+        if model_type not in self.model_types:
             raise InputError(
-                f"{quote_path(self.folder)} is a checkpoint of model_type {quote(found)}: "
+                f"{quote_path(self.folder)} is a checkpoint of model_type {quote(model_type)}: "
                 f"{self.needs} needs {' or '.join(self.model_types)}. Give the folder of such a "
                 "checkpoint."
             )
@@ -152,19 +153,23 @@ def _hash(path: Path, _modified: int) -> str:
     return sha256(path)
 
 
-def load_network(network: Any, folder: Path, *, device: str, dtype: str) -> Any:
-    """Load a class of transformers in a worker. Raises `InputError` if weights are missing."""
-    model, found = network.from_pretrained(
+def load_network(network: Any, folder: str, device: str, dtype: str) -> Any:
+    """Load a class of transformers on a device, in a worker.
+
+    Raises `InputError` if weights are missing, or if this machine lacks the device.
+    """
+    device = check_device(device)
+    model, report = network.from_pretrained(
         folder,
         local_files_only=True,
         use_safetensors=True,
         dtype=dtype,
         output_loading_info=True,
     )
-    wrong: Sequence[str] = sorted(map(str, [*found["missing_keys"], *found["mismatched_keys"]]))
+    wrong: Sequence[str] = sorted(map(str, [*report["missing_keys"], *report["mismatched_keys"]]))
     if wrong:
         raise InputError(
-            f"{quote_path(folder)} lacks {len(wrong)} weights of {network.__name__}, such as "
+            f"{quote_path(Path(folder))} lacks {len(wrong)} weights of {network.__name__}, such as "
             f"{quote(wrong[0])}, or has them in another shape. Download the checkpoint again."
         )
     return model.eval().to(device)

@@ -2,9 +2,10 @@
 
 Cameras and hand joints are the generator's inputs. The stages then run in this order:
 
+    HandMasks      draws hands and arms from the joints
+    TrackObjects   predicts the motion of the objects, and judges it by the clip's colors
     Segment        segments hands, arms, and the objects named by the state and by phrases
     EstimateDepth  aligns a depth network's maps with the state at static pixels
-    TrackMasks     follows objects by features inside their masks
     keep_changes   keeps depth of moved and new objects, revealed surfaces, and unknown regions
 
 Elsewhere depth is unknown, and the state does not change.
@@ -23,7 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Int32
 
 from egosim_jax.perception.classical import HandMasks, take_action
-from egosim_jax.perception.estimates import CameraEstimate, DepthEstimator, Segmenter, Verdict
+from egosim_jax.perception.clip.object_motion import TrackObjects
 from egosim_jax.perception.networks.align_depth import DepthAlignment
 from egosim_jax.perception.networks.checkpoint import DType
 from egosim_jax.perception.networks.depth_anything import DepthAnything
@@ -35,10 +36,10 @@ from egosim_jax.perception.networks.grounded import (
     GroundedSam2,
     GroundedSam3,
 )
-from egosim_jax.perception.networks.mask_tracking import TrackMasks
 from egosim_jax.perception.networks.sam3 import Sam3
 from egosim_jax.perception.pipeline import Observation, Pipeline, find_interactions
 from egosim_jax.perception.registry import register
+from egosim_jax.perception.video.estimates import CameraEstimate, DepthEstimator, Segmenter, Verdict
 from egosim_jax.rendering import POINT_PX
 from egosim_jax.rendering.reference import render
 from egosim_jax.state.filter import is_hand
@@ -80,18 +81,19 @@ class Segment:
                 "The state has no names of objects: segmentation needs at least one phrase. Name "
                 "movable objects, such as --phrases 'cup. book'. (--perception)"
             )
-        found, names = self.segmenter(clip.frames, (*dict.fromkeys(objects), *self.hands))
+        labels, names = self.segmenter(clip.frames, (*dict.fromkeys(objects), *self.hands))
         view = render(state, cameras, point_px=POINT_PX)
-        numbers = self._match(found, names, view, state)
+        numbers = self._match(labels, names, view, state)
         ids = hands.copy()
         for number, name in names.items():
-            ids[found == number] = numbers.get(number, -1) if not is_hand(name) else -abs(number)
+            ids[labels == number] = numbers.get(number, -1) if not is_hand(name) else -abs(number)
         new = {n: names[k] for k, n in numbers.items() if n not in state.names}
-        return replace(so_far, object_ids=ids.astype(np.int32), names=new)
+        names = {**(so_far.names or {}), **new}
+        return replace(so_far, object_ids=ids.astype(np.int32), names=names)
 
     def _match(
         self,
-        found: Int32[np.ndarray, "f h w"],
+        labels: Int32[np.ndarray, "f h w"],
         names: Mapping[int, str],
         view: View,
         state: SceneState,
@@ -100,11 +102,11 @@ class Segment:
 
         Pairs are matched greedily, by overlap plus 1 for the same name.
         """
-        known = np.unique(view.object_ids[view.object_ids > 0]).tolist()
+        numbers = np.unique(view.object_ids[view.object_ids > 0]).tolist()
         pairs = []
         for instance in [n for n, name in names.items() if not is_hand(name)]:
-            for number in known:
-                overlap = _largest_iou(found == instance, view.object_ids == number)
+            for number in numbers:
+                overlap = _largest_iou(labels == instance, view.object_ids == number)
                 if overlap >= self.min_overlap:
                     same = state.names.get(number, "").lower() == names[instance].lower()
                     pairs.append((same + overlap, instance, number))
@@ -138,10 +140,10 @@ class EstimateDepth:
             metric=True,
             verdict=Verdict(rung="given", reason="cameras of the action", figures={}),
         )
-        found = self.estimator(clip.frames, ids < 0, estimate, range(len(clip.frames)))
+        estimated = self.estimator(clip.frames, ids < 0, estimate, range(len(clip.frames)))
         view = render(state, cameras, point_px=POINT_PX)
         static = (ids == 0) & (view.object_ids == 0)
-        maps = zip(found.depth_m, view.depth_m, static, strict=True)
+        maps = zip(estimated.depth_m, view.depth_m, static, strict=True)
         depth = np.stack([self.alignment(*three) for three in maps])
         return replace(so_far, depth_m=depth)
 
@@ -157,8 +159,8 @@ def keep_changes(clip: Clip, action: Action, state: SceneState, so_far: Observat
         for name in ("cameras", "object_ids", "depth_m", "motions", "interacted_frames")
     )
     view = render(state, cameras, point_px=POINT_PX)
-    known = np.unique(state.object_ids)
-    changed = {*motions, *interacted, *np.setdiff1d(ids[ids > 0], known).tolist()}
+    numbers = np.unique(state.object_ids)
+    changed = {*motions, *interacted, *np.setdiff1d(ids[ids > 0], numbers).tolist()}
     kept = np.isin(ids, list(changed)) | ~np.isfinite(view.depth_m)
     kept |= np.isin(view.object_ids, list(changed)) & (ids == 0)
     kept &= ids >= 0
@@ -199,8 +201,8 @@ class NetworksConfig:
     """Drawing of hands and arms, used where segmentation finds nothing."""
     alignment: DepthAlignment = field(default_factory=DepthAlignment)
     """Alignment of depth with the state."""
-    tracking: TrackMasks = field(default_factory=TrackMasks)
-    """Tracking of objects inside their masks."""
+    motion: TrackObjects = field(default_factory=TrackObjects)
+    """Judgment of the predicted motion of objects."""
 
     def __post_init__(self) -> None:
         """Check the numbers and the phrases, and that each folder fits its network."""
@@ -224,7 +226,7 @@ class NetworksConfig:
             segmenter=masks, phrases=_split(self.phrases), hands=_split(self.hand_phrases)
         )
         estimate = EstimateDepth(estimator=depth, alignment=self.alignment)
-        stages = (take_action, self.hands, segment, estimate, self.tracking)
+        stages = (take_action, self.hands, self.motion, segment, estimate)
         return Pipeline(stages=(*stages, find_interactions, keep_changes))
 
     def _networks(

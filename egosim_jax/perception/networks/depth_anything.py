@@ -8,17 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Bool, UInt8
 
 from egosim_jax.io.bounded import quote, quote_path
-from egosim_jax.perception.estimates import CameraEstimate, DepthEstimate
-from egosim_jax.perception.networks.checkpoint import Network, check_device, load_network
-from egosim_jax.perception.networks.child import Run
-from egosim_jax.types import InputError, check_counts
+from egosim_jax.perception.networks.checkpoint import Network, load_network
+from egosim_jax.perception.networks.worker import Run
+from egosim_jax.perception.video.estimates import CameraEstimate, DepthEstimate
+from egosim_jax.types import InputError
 
 
 @dataclass(frozen=True)
@@ -32,11 +31,6 @@ class DepthAnything(Network):
     _: KW_ONLY
     batch: int = 4
     """Batch size of the network."""
-
-    def __post_init__(self) -> None:
-        """Check the folder and the batch size."""
-        super().__post_init__()
-        check_counts({"batch": self.batch})
 
     def check_config(self, config: Mapping[str, Any]) -> None:
         """Raise `InputError` unless this is a metric checkpoint of Depth Anything V2."""
@@ -56,8 +50,8 @@ class DepthAnything(Network):
         wanted: Sequence[int],
     ) -> DepthEstimate:
         """Return depth in meters of the wanted frames. The cameras are not used."""
-        found, _ = self.ask({"frames": frames[np.asarray(wanted, np.int32)]}, batch=self.batch)
-        return DepthEstimate.measured(wanted, found["depth_m"], metric=True)
+        reply, _ = self.ask({"frames": frames[np.asarray(wanted, np.int32)]}, batch=self.batch)
+        return DepthEstimate.measured(wanted, reply["depth_m"], metric=True)
 
 
 def load(folder: str, device: str, dtype: str) -> Run:
@@ -65,10 +59,7 @@ def load(folder: str, device: str, dtype: str) -> Run:
     import torch
     from transformers import DepthAnythingForDepthEstimation, DPTImageProcessorPil
 
-    device = check_device(device)
-    network = load_network(
-        DepthAnythingForDepthEstimation, Path(folder), device=device, dtype=dtype
-    )
+    network = load_network(DepthAnythingForDepthEstimation, folder, device, dtype)
     processor: Any = DPTImageProcessorPil.from_pretrained(folder, local_files_only=True)
 
     def run(arrays: Mapping[str, np.ndarray], options: Mapping[str, Any]):
@@ -78,10 +69,10 @@ def load(folder: str, device: str, dtype: str) -> Run:
             images = list(frames[start : start + options["batch"]])
             inputs = processor(images=images, return_tensors="pt")
             with torch.inference_mode():
-                output = network(inputs["pixel_values"].to(device, network.dtype))
+                output = network(inputs["pixel_values"].to(network.device, network.dtype))
             output.predicted_depth = output.predicted_depth.float()
-            found = processor.post_process_depth_estimation(output, [size] * len(images))
-            depth += [one["predicted_depth"].cpu().numpy() for one in found]
+            maps = processor.post_process_depth_estimation(output, [size] * len(images))
+            depth += [one["predicted_depth"].cpu().numpy() for one in maps]
         return {"depth_m": np.stack(depth)}, None
 
     return run

@@ -18,12 +18,13 @@ from jaxtyping import Bool, UInt8
 
 from egosim_jax.geometry import invert
 from egosim_jax.io.bounded import quote, quote_path
-from egosim_jax.perception.cameras.path import complete_path
-from egosim_jax.perception.depth.triangulate import triangulate_frames
-from egosim_jax.perception.estimates import CameraEstimate, DepthEstimate, Verdict
 from egosim_jax.perception.networks.checkpoint import Network, check_device
-from egosim_jax.perception.networks.child import Run
-from egosim_jax.types import Cameras, InputError, check_counts, is_rigid
+from egosim_jax.perception.networks.pixels import resize_maps
+from egosim_jax.perception.networks.worker import Run
+from egosim_jax.perception.video.cameras.path import complete_path
+from egosim_jax.perception.video.depth.triangulate import triangulate_frames
+from egosim_jax.perception.video.estimates import CameraEstimate, DepthEstimate, Verdict
+from egosim_jax.types import Cameras, InputError, is_rigid
 
 MIN_VIEWS = 2
 """Minimum number of views for alignment with given cameras."""
@@ -44,18 +45,13 @@ class _DepthAnything3(Network):
     resolution_px: int = 504
     """Longer side of the network's input images in pixels."""
 
-    def __post_init__(self) -> None:
-        """Check the folder, and that the size is positive."""
-        super().__post_init__()
-        check_counts({"resolution_px": self.resolution_px})
-
     def check_config(self, config: Mapping[str, Any]) -> None:
         """Raise `InputError` unless the config names a model of Depth Anything 3."""
         name = config.get("model_name")
         if not (isinstance(name, str) and name.startswith("da3")):
-            found = quote(config.get("model_type", name))
+            name_given = quote(config.get("model_type", name))
             raise InputError(
-                f"{quote_path(self.folder)} is a checkpoint of {found}: {self.needs} needs a "
+                f"{quote_path(self.folder)} is a checkpoint of {name_given}: {self.needs} needs a "
                 "config.json with a model_name such as da3nested-giant-large. Give its folder."
             )
 
@@ -67,11 +63,6 @@ class DepthAnything3(_DepthAnything3):
     _: KW_ONLY
     context: int = 8
     """Number of evenly spaced frames that the network sees besides the wanted ones."""
-
-    def __post_init__(self) -> None:
-        """Check the folder, and that sizes and numbers are positive."""
-        super().__post_init__()
-        check_counts({"context": self.context})
 
     def __call__(
         self,
@@ -95,8 +86,8 @@ class DepthAnything3(_DepthAnything3):
             arrays["extrinsics"] = invert(poses).astype(np.float32)
             matrix = estimate.cameras.intrinsics_px.astype(np.float32)
             arrays["intrinsics"] = np.repeat(matrix[None], len(views), axis=0)
-        found, about = self.ask(arrays, resolution_px=self.resolution_px)
-        depth = found["depth"][np.searchsorted(views, chosen)]
+        reply, about = self.ask(arrays, resolution_px=self.resolution_px)
+        depth = reply["depth"][np.searchsorted(views, chosen)]
         metric = estimate.metric if aligned else bool(about["metric"])
         return DepthEstimate.measured(wanted, depth, metric=metric)
 
@@ -117,11 +108,6 @@ class DepthAnything3Cameras(_DepthAnything3):
     max_error_px: float = 2.0
     """Maximum median reprojection error of the corners in pixels."""
 
-    def __post_init__(self) -> None:
-        """Check the folder, and that sizes and numbers are positive."""
-        super().__post_init__()
-        check_counts({"max_views": self.max_views - 1, "min_points": self.min_points})
-
     def __call__(
         self,
         frames: UInt8[np.ndarray, "f h w 3"],
@@ -135,19 +121,19 @@ class DepthAnything3Cameras(_DepthAnything3):
         """
         count, height, width = frames.shape[:3]
         views = np.unique(np.linspace(0, count - 1, min(self.max_views, count)).astype(int))
-        found, about = self.ask({"frames": frames[views]}, resolution_px=self.resolution_px)
-        if "extrinsics" not in found:
+        reply, about = self.ask({"frames": frames[views]}, resolution_px=self.resolution_px)
+        if "extrinsics" not in reply:
             raise InputError(
                 f"{quote_path(self.folder)} gives depth alone: cameras need a multi-view "
                 "checkpoint. Use one such as DA3-BASE. (--cameras)"
             )
         poses = np.repeat(np.eye(4)[None], len(views), axis=0)
-        poses[:, :3] = found["extrinsics"][:, :3]
+        poses[:, :3] = reply["extrinsics"][:, :3]
         if not is_rigid(poses).all():
             return _refused("the network's poses are not rigid transforms", {})
         cameras = Cameras(
             world_from_camera=complete_path(views, poses[0] @ invert(poses), count),
-            intrinsics_px=np.median(found["intrinsics"], axis=0).astype(float),
+            intrinsics_px=np.median(reply["intrinsics"], axis=0).astype(float),
             height=height,
             width=width,
         )
@@ -183,7 +169,6 @@ def _moves(estimate: CameraEstimate, views: np.ndarray) -> bool:
 def load(folder: str, device: str, dtype: str) -> Run:
     """Load the network in a worker. Its package chooses the precision."""
     import torch
-    from torch.nn.functional import interpolate
 
     program = importlib.import_module("depth_anything_3.api").DepthAnything3
     network = program.from_pretrained(folder, local_files_only=True, strict=True)
@@ -191,21 +176,23 @@ def load(folder: str, device: str, dtype: str) -> Run:
 
     def run(arrays: Mapping[str, np.ndarray], options: Mapping[str, Any]):
         size = arrays["frames"].shape[1:3]
-        found = network.inference(
+        prediction = network.inference(
             list(arrays["frames"]),
             extrinsics=arrays.get("extrinsics"),
             intrinsics=arrays.get("intrinsics"),
             process_res=options["resolution_px"],
         )
-        maps = torch.from_numpy(np.asarray(found.depth, np.float32))[:, None]
-        maps = interpolate(maps, size=size, mode="bilinear", align_corners=False)[:, 0]
-        reply = {"depth": maps.numpy()}
-        if found.extrinsics is not None and found.intrinsics is not None:
-            intrinsics = np.array(found.intrinsics, float)  # of the network's input images
-            scale = np.array(size[::-1]) / np.asarray(found.depth).shape[:0:-1]
+        maps = torch.from_numpy(np.asarray(prediction.depth, np.float32))
+        reply = {"depth": resize_maps(maps, size).numpy()}
+        if prediction.extrinsics is not None and prediction.intrinsics is not None:
+            intrinsics = np.array(prediction.intrinsics, float)  # of the network's input images
+            scale = np.array(size[::-1]) / np.asarray(prediction.depth).shape[:0:-1]
             intrinsics[:, :2] *= scale[:, None]
             intrinsics[:, :2, 2] += (scale - 1) / 2
-            reply |= {"extrinsics": np.asarray(found.extrinsics, float), "intrinsics": intrinsics}
-        return reply, {"metric": bool(found.is_metric)}
+            reply |= {
+                "extrinsics": np.asarray(prediction.extrinsics, float),
+                "intrinsics": intrinsics,
+            }
+        return reply, {"metric": bool(prediction.is_metric)}
 
     return run

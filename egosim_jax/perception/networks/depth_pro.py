@@ -16,10 +16,10 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from egosim_jax.perception.estimates import CameraEstimate, DepthEstimate
-from egosim_jax.perception.networks.checkpoint import Network, check_device, load_network
-from egosim_jax.perception.networks.child import Run
-from egosim_jax.perception.networks.pixels import PixelSettings, normalize, to_images
+from egosim_jax.perception.networks.checkpoint import Network, load_network
+from egosim_jax.perception.networks.pixels import PixelSettings, normalize, resize_maps, to_images
+from egosim_jax.perception.networks.worker import Run
+from egosim_jax.perception.video.estimates import CameraEstimate, DepthEstimate
 from egosim_jax.types import InputError
 
 FIELD_OF_VIEW_DEG = (10.0, 150.0)
@@ -72,8 +72,8 @@ class DepthPro(Network):
     def _estimate(
         self, frames: UInt8[np.ndarray, "f h w 3"]
     ) -> tuple[Float[np.ndarray, "f h w"], Float[np.ndarray, " f"]]:
-        found, _ = self.ask({"frames": frames})
-        return found["inverse_depth"], found["field_of_view_deg"]
+        reply, _ = self.ask({"frames": frames})
+        return reply["inverse_depth"], reply["field_of_view_deg"]
 
 
 def focal_of(fields_of_view_deg: Float[np.ndarray, " f"], width: int) -> float:
@@ -97,21 +97,19 @@ def load(folder: str, device: str, dtype: str) -> Run:
     from torch.nn.functional import interpolate
     from transformers import DepthProForDepthEstimation
 
-    device = check_device(device)
-    network = load_network(DepthProForDepthEstimation, Path(folder), device=device, dtype=dtype)
+    network = load_network(DepthProForDepthEstimation, folder, device, dtype)
     settings = PixelSettings.read(Path(folder), DEFAULT)
     size = settings.height, settings.width
 
     def run(arrays: Mapping[str, np.ndarray], options: Mapping[str, Any]):
         inverse, fields = [], []
         for frame in arrays["frames"]:
-            images = normalize(to_images(frame[None], device), settings.mean, settings.std)
+            images = normalize(to_images(frame[None], network.device), settings.mean, settings.std)
             images = interpolate(images, size=size, mode="bilinear", align_corners=False)
             with torch.inference_mode():
                 output = network(images.to(network.dtype))
-            maps = output.predicted_depth[:, None].float()
-            maps = interpolate(maps, size=frame.shape[:2], mode="bilinear", align_corners=False)
-            inverse.append(maps[0, 0].cpu().numpy())
+            maps = resize_maps(output.predicted_depth, frame.shape[:2])
+            inverse.append(maps[0].cpu().numpy())
             fields.append(output.field_of_view.float().cpu().numpy()[0])
         return {"inverse_depth": np.stack(inverse), "field_of_view_deg": np.array(fields)}, None
 

@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Bool, Int32, UInt8
 
 from egosim_jax.io.digest import fingerprint
-from egosim_jax.perception.estimates import HandTracks
 from egosim_jax.perception.networks.checkpoint import DType
 from egosim_jax.perception.networks.grounding_dino import Detection, GroundingDino, box_iou
 from egosim_jax.perception.networks.tracking import Box, EdgeTam, Sam2Tracker, Sam3Tracker, Tracker
+from egosim_jax.perception.video.estimates import HandTracks
 from egosim_jax.state.filter import is_hand
 from egosim_jax.types import check_counts
 
@@ -35,14 +35,14 @@ class _Track:
     score: float
     mask: Bool[np.ndarray, "f h w"]
 
-    def covers(self, frame: int, found: Detection, min_overlap: float) -> bool:
+    def covers(self, frame: int, detection: Detection, min_overlap: float) -> bool:
         """Return True if a detection in a frame is this object; a hand never matches an object."""
-        if is_hand(self.phrase) != is_hand(found.phrase) or not self.mask[frame].any():
+        if is_hand(self.phrase) != is_hand(detection.phrase) or not self.mask[frame].any():
             return False
         rows = np.flatnonzero(self.mask[frame].any(axis=1))
         columns = np.flatnonzero(self.mask[frame].any(axis=0))
         box = (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)
-        return box_iou(box, found.box_px) > min_overlap
+        return box_iou(box, detection.box_px) > min_overlap
 
 
 @dataclass(frozen=True)
@@ -106,9 +106,11 @@ class Grounded:
         detector, tracker = self._networks
         keys = np.arange(0, len(frames), self.every)
         tracks: list[_Track] = []
-        for frame, found in zip(keys.tolist(), detector(frames[keys], phrases), strict=True):
-            known = [] if hands is None else list(_hand_detections(hands, frame, frames.shape[1:3]))
-            new = self._new([*found, *known], tracks, frame)
+        for frame, detections in zip(keys.tolist(), detector(frames[keys], phrases), strict=True):
+            by_hands = (
+                [] if hands is None else list(_hand_detections(hands, frame, frames.shape[1:3]))
+            )
+            new = self._new([*detections, *by_hands], tracks, frame)
             if new:
                 labels = tracker(frames, frame, [one.box_px for one in new])
                 tracks += [
@@ -118,11 +120,11 @@ class Grounded:
         return _paint(tracks, frames.shape[:3])
 
     def _new(
-        self, found: Sequence[Detection], tracks: Sequence[_Track], frame: int
+        self, detections: Sequence[Detection], tracks: Sequence[_Track], frame: int
     ) -> list[Detection]:
         """Return a frame's detections that belong to no track and no better detection."""
         new: list[Detection] = []
-        for one in found:
+        for one in detections:
             twice = any(
                 is_hand(one.phrase) == is_hand(other.phrase)
                 and box_iou(one.box_px, other.box_px) > self.same_overlap

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from egosim_jax.perception.networks.checkpoint import Network, check_device, load_network
-from egosim_jax.perception.networks.child import Run
+from egosim_jax.perception.networks.checkpoint import Network, load_network
+from egosim_jax.perception.networks.worker import Run
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -56,9 +55,9 @@ class GroundingDino(Network):
     ) -> list[list[Detection]]:
         """Return the detections in each frame, best first."""
         phrases = clean_phrases(phrases)
-        found, _ = self.ask({"frames": frames}, phrases=phrases)
+        reply, _ = self.ask({"frames": frames}, phrases=phrases)
         detections: list[list[Detection]] = []
-        for scores, boxes in zip(found["scores"], found["boxes_px"], strict=True):
+        for scores, boxes in zip(reply["scores"], reply["boxes_px"], strict=True):
             best = scores.argmax(axis=1)
             kept: list[Detection] = []
             for query in np.argsort(-scores.max(axis=1), kind="stable"):
@@ -84,13 +83,13 @@ def clean_phrases(phrases: Sequence[str]) -> list[str]:
     Raises `InputError` without any phrase, and for a phrase that is too long.
     """
     clean = [" ".join(p.lower().replace(".", " ").split()) for p in phrases]
-    found = list(dict.fromkeys(filter(None, clean)))
-    if not found or max(map(len, found)) > MAX_PHRASE:
+    unique = list(dict.fromkeys(filter(None, clean)))
+    if not unique or max(map(len, unique)) > MAX_PHRASE:
         raise InputError(
-            f"{len(found)} phrases, of up to {max(map(len, found), default=0)} characters: there "
+            f"{len(unique)} phrases, of up to {max(map(len, unique), default=0)} characters: there "
             f"must be at least one phrase, of at most {MAX_PHRASE}. Name the objects. (--phrases)"
         )
-    return found
+    return unique
 
 
 def box_iou(a: Sequence[float], b: Sequence[float]) -> float:
@@ -112,10 +111,7 @@ def load(folder: str, device: str, dtype: str) -> Run:
         GroundingDinoProcessor,
     )
 
-    device = check_device(device)
-    network = load_network(
-        GroundingDinoForObjectDetection, Path(folder), device=device, dtype=dtype
-    )
+    network = load_network(GroundingDinoForObjectDetection, folder, device, dtype)
     images = GroundingDinoImageProcessorPil.from_pretrained(folder, local_files_only=True)
     tokenizer: Any = BertTokenizer.from_pretrained(folder, local_files_only=True)
     processor: Any = GroundingDinoProcessor(images, tokenizer)
@@ -132,9 +128,9 @@ def load(folder: str, device: str, dtype: str) -> Run:
             parts = [_detect(frame, group) for group in texts]
             filled = np.zeros((sum(len(s) for s, _ in parts), len(options["phrases"])))
             row = column = 0
-            for found, _ in parts:
-                height, width = found.shape
-                filled[row : row + height, column : column + width] = found
+            for block, _ in parts:
+                height, width = block.shape
+                filled[row : row + height, column : column + width] = block
                 row, column = row + height, column + width
             scores.append(filled)
             boxes.append(np.concatenate([box for _, box in parts]))
@@ -142,16 +138,16 @@ def load(folder: str, device: str, dtype: str) -> Run:
 
     def _detect(frame: np.ndarray, phrases: Sequence[str]):
         inputs = processor(images=frame, text=". ".join(phrases) + ".", return_tensors="pt")
-        inputs = inputs.to(device)
+        inputs = inputs.to(network.device)
         inputs["pixel_values"] = inputs["pixel_values"].to(network.dtype)
         with torch.inference_mode():
             output = network(**inputs)
         scores = output.logits[0].float().sigmoid()
-        found = phrase_scores(scores, inputs["input_ids"][0], full_stop)
+        scored = phrase_scores(scores, inputs["input_ids"][0], full_stop)
         height, width = frame.shape[:2]
         center, size = output.pred_boxes[0].float().cpu().split(2, dim=-1)
         corners = torch.cat([center - size / 2, center + size / 2], dim=-1)
-        return found.cpu().numpy(), (corners * torch.tensor([width, height] * 2)).numpy()
+        return scored.cpu().numpy(), (corners * torch.tensor([width, height] * 2)).numpy()
 
     return run
 

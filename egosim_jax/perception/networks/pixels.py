@@ -38,22 +38,22 @@ class PixelSettings:
         video_preprocessor_config.json overrides preprocessor_config.json, which overrides
         processor_config.json.
         """
-        found: dict[str, Any] = {}
+        settings: dict[str, Any] = {}
         for name in ("processor_config", "preprocessor_config", "video_preprocessor_config"):
             path = folder / f"{name}.json"
             if path.is_file():
                 content = read_json(path)
-                for part in ("image_processor", "video_processor"):
-                    found |= content.get(part) or {}
-                found |= content
-        size = found.get("size") or {"height": default.height, "width": default.width}
+                for key in ("image_processor", "video_processor"):
+                    settings |= content.get(key) or {}
+                settings |= content
+        size = settings.get("size") or {"height": default.height, "width": default.width}
         values = tuple(size.get(side) or 0 for side in ("height", "width"))
         if not all(isinstance(v, int) and 0 < v <= MAX_SIZE for v in values):
             raise InputError(
                 f"{quote_path(folder)}: size {quote(str(size))} of its image processor is not a "
                 f"height and a width of at most {MAX_SIZE} pixels. Download its files again."
             )
-        mean, std = (found.get(f"image_{n}") or getattr(default, n) for n in ("mean", "std"))
+        mean, std = (settings.get(f"image_{n}") or getattr(default, n) for n in ("mean", "std"))
         if not (len(mean) == len(std) == 3 and min(std) > 0):
             raise InputError(
                 f"{quote_path(folder)}: image_mean {quote(str(mean))} and image_std "
@@ -73,6 +73,14 @@ def to_images(frames: np.ndarray, device: str) -> torch.Tensor:
     import torch
 
     return torch.from_numpy(np.ascontiguousarray(frames)).to(device).movedim(-1, 1).float()
+
+
+def resize_maps(maps: torch.Tensor, size: tuple[int, ...]) -> torch.Tensor:
+    """Return maps `n h w` of numbers at another size."""
+    from torch.nn.functional import interpolate
+
+    scaled = interpolate(maps[:, None].float(), size=size, mode="bilinear", align_corners=False)
+    return scaled[:, 0]
 
 
 def resize_levels(images: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:

@@ -11,17 +11,15 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import UInt8
 
-from egosim_jax.perception.networks.checkpoint import Network, check_device, load_network
-from egosim_jax.perception.networks.child import Run
-from egosim_jax.perception.networks.worker import NetworkError
+from egosim_jax.perception.networks.checkpoint import Network, load_network
+from egosim_jax.perception.networks.worker import NetworkError, Run
 from egosim_jax.state.filter import is_hand
-from egosim_jax.types import InputError, check_counts
+from egosim_jax.types import InputError
 
 MAX_CAPTION = 600
 """Maximum length of a caption in characters."""
@@ -56,11 +54,6 @@ class Qwen3VL(Network):
     prompt: str = PROMPT
     """Question; {count} is the number of frames."""
 
-    def __post_init__(self) -> None:
-        """Check the folder and that the numbers are positive."""
-        super().__post_init__()
-        check_counts({"images": self.images, "max_new_tokens": self.max_new_tokens})
-
     def __call__(self, frames: UInt8[np.ndarray, "f h w 3"]) -> tuple[str, tuple[str, ...]]:
         """Return the caption and the names of moved objects.
 
@@ -91,14 +84,14 @@ def parse_reply(text: str) -> tuple[str, tuple[str, ...]]:
     Names are unique, in lower case and without articles. Names of hands are dropped. Raises
     `NetworkError` if the reply has no caption.
     """
-    found = _json_object(text)
-    caption = found.get("caption")
+    reply = _json_object(text)
+    caption = reply.get("caption")
     if not isinstance(caption, str) or not (caption := _one_line(caption, MAX_CAPTION)):
         raise NetworkError(
             f"Qwen3-VL replied without a caption: {_one_line(text, 200)!r}. Give a caption "
             "(--caption), or use a larger checkpoint."
         )
-    objects = found.get("objects")
+    objects = reply.get("objects")
     names = [n for n in objects if isinstance(n, str)] if isinstance(objects, list) else []
     clean = [ARTICLE.sub("", _one_line(name, MAX_NAME).lower()).strip(" .") for name in names]
     kept = [name for name in dict.fromkeys(clean) if name and not is_hand(name)]
@@ -133,10 +126,7 @@ def load(folder: str, device: str, dtype: str) -> Run:
         Qwen3VLForConditionalGeneration,
     )
 
-    device = check_device(device)
-    network: Any = load_network(
-        Qwen3VLForConditionalGeneration, Path(folder), device=device, dtype=dtype
-    )
+    network: Any = load_network(Qwen3VLForConditionalGeneration, folder, device, dtype)
     processor = Qwen2VLImageProcessorPil.from_pretrained(folder, local_files_only=True)
     tokenizer: Any = Qwen2Tokenizer.from_pretrained(folder, local_files_only=True)
 
@@ -155,7 +145,7 @@ def load(folder: str, device: str, dtype: str) -> Run:
         }
         with torch.inference_mode():
             output = network.generate(
-                **{name: value.to(device) for name, value in inputs.items()},
+                **{name: value.to(network.device) for name, value in inputs.items()},
                 max_new_tokens=options["max_new_tokens"],
                 do_sample=False,
             )

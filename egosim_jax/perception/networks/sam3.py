@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from jaxtyping import Int32, UInt8
 
-from egosim_jax.perception.estimates import HandTracks
-from egosim_jax.perception.networks.checkpoint import Network, check_device, load_network
-from egosim_jax.perception.networks.child import Run
+from egosim_jax.perception.networks.checkpoint import Network, load_network
 from egosim_jax.perception.networks.grounding_dino import clean_phrases
-from egosim_jax.perception.networks.pixels import PixelSettings
-from egosim_jax.perception.networks.tracking import SAM3_PIXELS, PreparedFrames
+from egosim_jax.perception.networks.pixels import PixelSettings, resize_maps
+from egosim_jax.perception.networks.tracking import SAM3_PIXELS, new_session
+from egosim_jax.perception.networks.worker import Run
+from egosim_jax.perception.video.estimates import HandTracks
 from egosim_jax.state.filter import is_hand
 
 if TYPE_CHECKING:
@@ -49,13 +49,13 @@ class Sam3(Network):
         Known hands are not used, because the network's prompts are phrases.
         """
         phrases = clean_phrases(phrases)
-        found, instances = self.ask({"frames": frames}, phrases=phrases)
+        reply, instances = self.ask({"frames": frames}, phrases=phrases)
         names = {
             (-1 if is_hand(phrase) else 1) * number: phrase
             for number, phrase in enumerate(instances, start=1)
         }
         signs = np.array([0, *(np.sign(number) for number in names)], np.int32)
-        return found["labels"] * signs[found["labels"]], names
+        return reply["labels"] * signs[reply["labels"]], names
 
 
 def load(folder: str, device: str, dtype: str) -> Run:
@@ -65,28 +65,20 @@ def load(folder: str, device: str, dtype: str) -> Run:
     from transformers.models.sam3_video import modeling_sam3_video
 
     modeling_sam3_video.cv_utils_kernel = MaskTools()
-    device = check_device(device)
-    network: Any = load_network(Sam3VideoModel, Path(folder), device=device, dtype=dtype)
+    network: Any = load_network(Sam3VideoModel, folder, device, dtype)
     tokenizer: Any = CLIPTokenizer.from_pretrained(folder, local_files_only=True)
     pixels = PixelSettings.read(Path(folder), SAM3_PIXELS)
 
     def run(arrays: Mapping[str, np.ndarray], options: Mapping[str, Any]):
         frames = arrays["frames"]
         height, width = frames.shape[1:3]
-        session: Any = Sam3VideoInferenceSession(
-            video_height=height,
-            video_width=width,
-            inference_device=device,
-            inference_state_device=device,
-            dtype=network.dtype,
-        )
-        session.processed_frames = PreparedFrames(frames, pixels, network.dtype)
+        session = new_session(Sam3VideoInferenceSession, network, frames, pixels)
         for phrase in options["phrases"]:
             number = session.add_prompt(phrase)
             text = tokenizer(
                 phrase, return_tensors="pt", padding="max_length", max_length=MAX_TOKENS,
                 truncation=True,
-            ).to(device)  # fmt: skip
+            ).to(network.device)  # fmt: skip
             session.prompt_input_ids[number] = text["input_ids"]
             session.prompt_attention_masks[number] = text["attention_mask"]
         labels = np.zeros(frames.shape[:3], np.int32)
@@ -94,11 +86,11 @@ def load(folder: str, device: str, dtype: str) -> Run:
         phrase_of: dict[int, str] = {}
         with torch.inference_mode():
             for output in network.propagate_in_video_iterator(session):
-                for found, mask in visible_masks(output, session, (height, width)):
-                    label = numbers.setdefault(found, len(numbers) + 1)
+                for instance, mask in visible_masks(output, session, (height, width)):
+                    label = numbers.setdefault(instance, len(numbers) + 1)
                     labels[output.frame_idx][mask] = label
-                for found, prompt in session.obj_id_to_prompt_id.items():
-                    phrase_of[found] = session.prompts[prompt]  # before it forgets the object
+                for instance, prompt in session.obj_id_to_prompt_id.items():
+                    phrase_of[instance] = session.prompts[prompt]  # before it forgets the object
         return {"labels": labels}, [phrase_of[number] for number in numbers]
 
     return run
@@ -109,18 +101,15 @@ def visible_masks(output: Any, session: Any, size: tuple[int, int]) -> list[tupl
 
     Where masks overlap, the last one wins. Objects that the network suppressed are omitted.
     """
-    from torch.nn.functional import interpolate
-
     hidden = {*(output.suppressed_obj_ids or ()), *session.hotstart_removed_obj_ids}
     scores = output.obj_id_to_tracker_score or {}
-    found = []
+    masks = []
     for number in sorted(output.obj_id_to_mask, key=lambda n: (float(scores.get(n, 0.0)), n)):
         if number not in hidden:
-            logits = output.obj_id_to_mask[number][None].float()
-            mask = interpolate(logits, size=size, mode="bilinear", align_corners=False)[0, 0] > 0
+            mask = resize_maps(output.obj_id_to_mask[number], size)[0] > 0
             if mask.any():
-                found.append((number, mask.cpu().numpy()))
-    return found
+                masks.append((number, mask.cpu().numpy()))
+    return masks
 
 
 class MaskTools:
@@ -149,9 +138,10 @@ class MaskTools:
         labels = np.zeros(masks.shape, np.int32)
         areas = np.zeros(masks.shape, np.int32)
         for place in np.ndindex(*masks.shape[:-2]):
-            found: Any = cv2.connectedComponentsWithStats(
+            components: Any = cv2.connectedComponentsWithStats(
                 masks[place].cpu().numpy(), connectivity=8
             )
-            labels[place] = found[1]
-            areas[place] = np.where(found[1] > 0, found[2][:, cv2.CC_STAT_AREA][found[1]], 0)
+            labels[place] = components[1]
+            sizes = components[2][:, cv2.CC_STAT_AREA]
+            areas[place] = np.where(components[1] > 0, sizes[components[1]], 0)
         return torch.from_numpy(labels).to(masks.device), torch.from_numpy(areas).to(masks.device)

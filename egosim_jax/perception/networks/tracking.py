@@ -18,9 +18,15 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from jaxtyping import Int32, UInt8
 
-from egosim_jax.perception.networks.checkpoint import CONFIG, Network, check_device, load_network
-from egosim_jax.perception.networks.child import Run
-from egosim_jax.perception.networks.pixels import PixelSettings, normalize, resize_levels, to_images
+from egosim_jax.perception.networks.checkpoint import CONFIG, Network, load_network
+from egosim_jax.perception.networks.pixels import (
+    PixelSettings,
+    normalize,
+    resize_levels,
+    resize_maps,
+    to_images,
+)
+from egosim_jax.perception.networks.worker import Run
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -48,10 +54,10 @@ class Tracker(Network):
         The boxes contain the objects in one frame. The objects are tracked forward and backward
         from there.
         """
-        found, _ = self.ask(
+        reply, _ = self.ask(
             {"frames": frames, "boxes_px": np.asarray(boxes_px, np.float32)}, frame=frame
         )
-        return found["labels"]
+        return reply["labels"]
 
 
 @dataclass(frozen=True)
@@ -102,25 +108,17 @@ def load(folder: str, device: str, dtype: str) -> Run:
     network_type = getattr(transformers, f"{name}Model")
     module = importlib.import_module(network_type.__module__)
     session_type = getattr(module, f"{name}InferenceSession")
-    device = check_device(device)
-    network = load_network(network_type, Path(folder), device=device, dtype=dtype)
+    network = load_network(network_type, folder, device, dtype)
     pixels = PixelSettings.read(Path(folder), default)
 
     def run(arrays: Mapping[str, np.ndarray], options: Mapping[str, Any]):
         frames = arrays["frames"]
         height, width = frames.shape[1:3]
-        session = session_type(
-            video_height=height,
-            video_width=width,
-            inference_device=device,
-            inference_state_device=device,
-            dtype=network.dtype,
-        )
-        session.processed_frames = PreparedFrames(frames, pixels, network.dtype)
+        session = new_session(session_type, network, frames, pixels)
         scale = np.array([pixels.width / width, pixels.height / height] * 2, np.float32)
         for number, box in enumerate(arrays["boxes_px"] * scale, start=1):
-            points = torch.from_numpy(box).to(device).reshape(1, 1, 2, 2)
-            labels = torch.tensor(BOX_LABELS, dtype=torch.int32, device=device).reshape(1, 1, 2)
+            points = torch.from_numpy(box).to(network.device).reshape(1, 1, 2, 2)
+            labels = torch.tensor(BOX_LABELS, dtype=torch.int32).to(network.device).reshape(1, 1, 2)
             inputs = {"point_coords": points, "point_labels": labels}
             session.add_point_inputs(session.obj_id_to_idx(number), options["frame"], inputs)
             session.obj_with_new_inputs.append(number)
@@ -131,6 +129,19 @@ def load(folder: str, device: str, dtype: str) -> Run:
         return {"labels": labels}, None
 
     return run
+
+
+def new_session(session: Any, network: Any, frames: np.ndarray, pixels: PixelSettings) -> Any:
+    """Return a session of a class of transformers in which a network sees a video."""
+    opened = session(
+        video_height=frames.shape[1],
+        video_width=frames.shape[2],
+        inference_device=network.device,
+        inference_state_device=network.device,
+        dtype=network.dtype,
+    )
+    opened.processed_frames = PreparedFrames(frames, pixels, network.dtype)
+    return opened
 
 
 def _propagate(network: Any, session: Any, start: int) -> Iterator[Any]:
@@ -159,10 +170,5 @@ class PreparedFrames:
 
 def to_labels(logits: torch.Tensor, size: tuple[int, int]) -> np.ndarray:
     """Return the number (from 1) of the mask with the largest positive logit at each pixel."""
-    from torch.nn.functional import interpolate
-
-    resized = interpolate(logits[:, None].float(), size=size, mode="bilinear", align_corners=False)[
-        :, 0
-    ]
-    best, index = resized.max(dim=0)
+    best, index = resize_maps(logits, size).max(dim=0)
     return (((index + 1) * (best > 0)).cpu().numpy()).astype(np.int32)

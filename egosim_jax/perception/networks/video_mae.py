@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from egosim_jax.io.bounded import read_json
-from egosim_jax.perception.networks.checkpoint import Network, check_device, load_network
-from egosim_jax.perception.networks.child import Run
+from egosim_jax.perception.networks.checkpoint import Network, load_network
 from egosim_jax.perception.networks.pixels import normalize, resize_levels, to_images
+from egosim_jax.perception.networks.worker import Run
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Mean and standard deviation of ImageNet, for checkpoints without a processor file."""
@@ -34,8 +34,8 @@ class VideoMae(Network):
 
     def __call__(self, frames: UInt8[np.ndarray, "f h w 3"]) -> Float32[np.ndarray, " d"]:
         """Return the mean feature of the tubes of evenly spaced frames."""
-        found, _ = self.ask({"frames": frames})
-        return found["features"]
+        reply, _ = self.ask({"frames": frames})
+        return reply["features"]
 
 
 def load(folder: str, device: str, dtype: str) -> Run:
@@ -43,8 +43,7 @@ def load(folder: str, device: str, dtype: str) -> Run:
     import torch
     from transformers import VideoMAEModel
 
-    device = check_device(device)
-    network = load_network(VideoMAEModel, Path(folder), device=device, dtype=dtype)
+    network = load_network(VideoMAEModel, folder, device, dtype)
     size = network.config.image_size
     sides = (size, size) if isinstance(size, int) else tuple(size)
     mean, std = _statistics(Path(folder))
@@ -53,7 +52,9 @@ def load(folder: str, device: str, dtype: str) -> Run:
         frames = arrays["frames"]
         count = network.config.num_frames
         chosen = np.linspace(0, len(frames) - 1, count).round().astype(int)
-        images = normalize(resize_levels(to_images(frames[chosen], device), sides), mean, std)
+        images = normalize(
+            resize_levels(to_images(frames[chosen], network.device), sides), mean, std
+        )
         with torch.inference_mode():
             output = network(images[None].to(network.dtype)).last_hidden_state
         return {"features": output[0].float().mean(dim=0).cpu().numpy()}, None
@@ -64,5 +65,5 @@ def load(folder: str, device: str, dtype: str) -> Run:
 def _statistics(folder: Path) -> tuple[Sequence[float], Sequence[float]]:
     """Return the mean and standard deviation of a checkpoint's training colors."""
     path = folder / "preprocessor_config.json"
-    found = read_json(path) if path.is_file() else {}
-    return found.get("image_mean") or MEAN, found.get("image_std") or STD
+    settings = read_json(path) if path.is_file() else {}
+    return settings.get("image_mean") or MEAN, settings.get("image_std") or STD

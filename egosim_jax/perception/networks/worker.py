@@ -1,38 +1,35 @@
 """Worker processes that run networks: started, fed and ended by the calling process.
 
-The calling process never imports torch, whose memory and libraries would conflict with jax.
-Requests and replies are lines of JSON over pipes. Arrays are npz files without pickle in a private
-temporary folder. A worker starts at its first request and keeps its network loaded. It ends when
-its pipe closes, and so also when its parent is killed.
+The calling process never imports torch, whose memory and libraries would conflict with jax. A
+socket carries messages: a JSON value, then arrays as npz without pickle. A worker starts at its
+first request and keeps its network loaded. It ends when its socket closes, and so also when its
+parent is killed. `child` is its program.
 """
 
 from __future__ import annotations
 
 import atexit
+import io
 import json
 import os
-import select
-import shutil
+import socket
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Callable, Mapping
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import Any
 
 import numpy as np
 
-from egosim_jax.io.untrusted.npz import read_all
 from egosim_jax.runtime.command import CommandExit, ExitCode
 from egosim_jax.types import InputError
 
 MAX_TAIL_LINES, MAX_TAIL_BYTES = 12, 4096
 """Maximum lines and bytes of a worker's error output in a message."""
-MAX_REPLY_BYTES = 1 << 20
-"""Maximum size of a reply in bytes, without its arrays."""
 ENVIRONMENT = {
     "HF_HUB_OFFLINE": "1",
     "HF_HUB_DISABLE_PROGRESS_BARS": "1",
@@ -42,6 +39,8 @@ ENVIRONMENT = {
 """Environment variables of a worker: it downloads neither weights nor code."""
 
 Arrays = Mapping[str, np.ndarray]
+Run = Callable[[Arrays, Mapping[str, Any]], tuple[Arrays, Any]]
+"""Network that a module's `load` returns: maps arrays and options to arrays and a JSON value."""
 
 
 class NetworkError(CommandExit):
@@ -49,6 +48,21 @@ class NetworkError(CommandExit):
 
     def __init__(self, message: str):
         super().__init__(message, ExitCode.FAILED)
+
+
+def send(connection: Connection, value: Any, arrays: Arrays) -> None:
+    """Send a JSON value and arrays to the other process."""
+    packed, content = io.BytesIO(), dict[str, Any](arrays)
+    np.savez(packed, **content)
+    connection.send_bytes(json.dumps(value).encode())
+    connection.send_bytes(packed.getbuffer())
+
+
+def receive(connection: Connection) -> tuple[Any, dict[str, np.ndarray]]:
+    """Return the next value and arrays. Raises `OSError` or `EOFError` if the socket is closed."""
+    value = json.loads(connection.recv_bytes())
+    with np.load(io.BytesIO(connection.recv_bytes()), allow_pickle=False) as content:
+        return value, dict(content)
 
 
 class Worker:
@@ -71,43 +85,30 @@ class Worker:
         """
         with self._lock:
             deadline = time.monotonic() + timeout_s
+            if self._child is None or not self._child.is_alive():
+                self._end()
+                self._child = _Child(self._module)
+            child = self._child
             try:
-                child = self._running(deadline)
-                request: dict[str, Any] = dict(arrays)
-                np.savez(child.folder / "request.npz", **request)
-                value = child.exchange({"options": dict(options)}, deadline)
-                return read_all(child.folder / "reply.npz"), value
-            except InputError:
-                raise  # the worker is ready for the next request
-            except TimeoutError:
-                self._end()
-                raise NetworkError(
-                    f"{self._module.rpartition('.')[2]} did not finish in {timeout_s:g} s: its "
-                    "worker process was ended. Allow more time (--timeout-s), or use a GPU "
-                    "(--device cuda:0)."
-                ) from None
-            except BaseException:
-                self._end()
+                if not child.loaded:
+                    child.exchange(self._settings, {}, deadline)
+                    child.loaded = True
+                return child.exchange(dict(options), arrays, deadline)
+            except BaseException as error:
+                if not (child.loaded and isinstance(error, InputError)):
+                    self._end()  # after a refusal, it is ready for the next request
+                if isinstance(error, TimeoutError):
+                    raise NetworkError(
+                        f"{self._module.rpartition('.')[2]} did not finish in {timeout_s:g} s: its "
+                        "worker process was ended. Allow more time (--timeout-s), or use a GPU "
+                        "(--device cuda:0)."
+                    ) from None
                 raise
 
     def close(self) -> None:
-        """End the worker process and remove its files."""
+        """End the worker process."""
         with self._lock:
             self._end()
-
-    def _running(self, deadline: float) -> _Child:
-        """Return the child process. Start it and load its network if it is not alive."""
-        if self._child is None or not self._child.is_alive():
-            self._end()
-            self._child = _Child(self._module)
-            try:
-                self._child.exchange(
-                    {"settings": self._settings, "folder": str(self._child.folder)}, deadline
-                )
-            except InputError:
-                self._end()
-                raise
-        return self._child
 
     def _end(self) -> None:
         child, self._child = self._child, None
@@ -116,76 +117,65 @@ class Worker:
 
 
 class _Child:
-    """A running child process, its pipes and its folder."""
+    """A running child process and its socket."""
 
     def __init__(self, module: str):
         self._name = module.rpartition(".")[2]
-        self.folder = Path(tempfile.mkdtemp(prefix="egosim-network-"))
+        self.loaded = False
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
         paths = [str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH", "")]
         variables = {**ENVIRONMENT, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
-        with (self.folder / "stderr").open("wb") as errors:
+        ours, theirs = socket.socketpair()
+        with theirs:
+            program = ["-m", "egosim_jax.perception.networks.child", module, str(theirs.fileno())]
             self._process = subprocess.Popen(  # noqa: S603 - this package's module
-                [sys.executable, "-P", "-m", "egosim_jax.perception.networks.child", module],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=errors,
+                [sys.executable, "-P", *program],
+                stdin=subprocess.DEVNULL,
+                stdout=self._errors,  # with the output of libraries
+                stderr=self._errors,
                 env={**os.environ, **variables},
+                pass_fds=[theirs.fileno()],
                 process_group=0,  # Ctrl-C in a terminal is for the parent alone
             )
-        self._requests = cast(IO[bytes], self._process.stdin)
-        self._replies = cast(IO[bytes], self._process.stdout)
-        self._unread = b""
+        self._connection = Connection(ours.detach())
 
     def is_alive(self) -> bool:
         return self._process.poll() is None
 
-    def exchange(self, request: Mapping[str, Any], deadline: float) -> Any:
-        """Send a request and return the value of its reply."""
+    def exchange(
+        self, value: Any, arrays: Arrays, deadline: float
+    ) -> tuple[dict[str, np.ndarray], Any]:
+        """Send a request and return the arrays and the value of its reply."""
         try:
-            self._requests.write(json.dumps(request).encode() + b"\n")
-            self._requests.flush()
-        except BrokenPipeError:
+            send(self._connection, value, arrays)
+            if not self._connection.poll(max(0.0, deadline - time.monotonic())):
+                raise TimeoutError
+            reply, result = receive(self._connection)
+        except (EOFError, ConnectionError):
             raise self._death() from None
-        reply = json.loads(self._read_line(deadline))
         if "value" in reply:
-            return reply["value"]
+            return result, reply["value"]
         if reply["refused"]:
             raise InputError(reply["error"])
         raise NetworkError(f"{self._name} failed in its worker process: {reply['error']}")
 
     def end(self) -> None:
-        """Kill the process and remove its folder."""
+        """Kill the process."""
         self._process.kill()
         self._process.wait()
-        with suppress(BrokenPipeError):
-            self._requests.close()
-        self._replies.close()
-        shutil.rmtree(self.folder, ignore_errors=True)
-
-    def _read_line(self, deadline: float) -> bytes:
-        descriptor = self._replies.fileno()
-        while b"\n" not in self._unread:
-            left = deadline - time.monotonic()
-            if left <= 0 or not select.select([descriptor], [], [], left)[0]:
-                raise TimeoutError
-            data = os.read(descriptor, 1 << 16)
-            if not data or len(self._unread) > MAX_REPLY_BYTES:
-                raise self._death()
-            self._unread += data
-        line, _, self._unread = self._unread.partition(b"\n")
-        return line
+        self._connection.close()
+        self._errors.close()
 
     def _death(self) -> NetworkError:
-        """Return the error for a closed pipe, with the end of the process's error output."""
+        """Return the error for a closed socket, with the end of the process's error output."""
         try:
             code = self._process.wait(5)
         except subprocess.TimeoutExpired:
             code = None
         how = f"signal {-code}" if code and code < 0 else f"exit code {code}"
         hint = " It may have run out of memory." if code == -9 else ""
-        with (self.folder / "stderr").open("rb") as file:
-            file.seek(max(0, os.fstat(file.fileno()).st_size - MAX_TAIL_BYTES))
-            lines = file.read().decode("utf-8", "replace").splitlines()[-MAX_TAIL_LINES:]
+        self._errors.seek(max(0, self._errors.seek(0, os.SEEK_END) - MAX_TAIL_BYTES))
+        lines = self._errors.read().decode("utf-8", "replace").splitlines()[-MAX_TAIL_LINES:]
         tail = "\n".join("".join(c for c in line if c.isprintable()) for line in lines)
         return NetworkError(
             f"{self._name}: the worker process ended during a request ({how}).{hint} Its last "

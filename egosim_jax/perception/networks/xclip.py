@@ -18,8 +18,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from egosim_jax.io.bounded import read_json
-from egosim_jax.perception.networks.checkpoint import Network, check_device, load_network
-from egosim_jax.perception.networks.child import Run
+from egosim_jax.perception.networks.checkpoint import Network, load_network
+from egosim_jax.perception.networks.worker import Run
 
 PREPROCESSOR = "preprocessor_config.json"
 MEAN, STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
@@ -36,8 +36,8 @@ class XClip(Network):
 
     def __call__(self, video: UInt8[np.ndarray, "f h w 3"], text: str) -> float:
         """Return the cosine similarity of a video and a text, from -1 to 1."""
-        found, _ = self.ask({"video": video}, text=text)
-        return float(found["similarity"])
+        reply, _ = self.ask({"video": video}, text=text)
+        return float(reply["similarity"])
 
 
 def load(folder: str, device: str, dtype: str) -> Run:
@@ -45,8 +45,7 @@ def load(folder: str, device: str, dtype: str) -> Run:
     import torch
     from transformers import CLIPTokenizer, XCLIPModel
 
-    device = check_device(device)
-    network = load_network(XCLIPModel, Path(folder), device=device, dtype=dtype)
+    network = load_network(XCLIPModel, folder, device, dtype)
     tokenizer: Any = CLIPTokenizer.from_pretrained(folder, local_files_only=True)
     settings = read_json(Path(folder) / PREPROCESSOR)
     vision = network.config.vision_config
@@ -58,8 +57,10 @@ def load(folder: str, device: str, dtype: str) -> Run:
         pixels = prepare(
             arrays["video"], frames=vision.num_frames, size=vision.image_size, mean=mean, std=std
         )
-        tokens = tokenizer([options["text"]], truncation=True, return_tensors="pt").to(device)
-        pixels = torch.from_numpy(pixels)[None].to(device, network.dtype)
+        tokens = tokenizer([options["text"]], truncation=True, return_tensors="pt").to(
+            network.device
+        )
+        pixels = torch.from_numpy(pixels)[None].to(network.device, network.dtype)
         with torch.inference_mode():
             output = network(pixel_values=pixels, **tokens)
             similarity = output.logits_per_video[0, 0] / network.logit_scale.exp()

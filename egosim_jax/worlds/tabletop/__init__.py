@@ -13,21 +13,22 @@ Scenes (`scene`, `scene_spec`)
     Scene: all bodies and their poses; sample_scene: a random one; Object, make_scene: your own;
     read_scene, write_scene: scenes as JSON
 Clips (`clips`)
-    TabletopClip: clip with ground truth; to_triplet, to_action, to_episode, to_ground_truth:
+    TabletopClip: clip with ground truth; to_triplet, to_action, to_episode, observation_of:
     conversions; state_after: a state moved by the ground-truth motion
 
-Other modules: `dataset` makes shards; `attempts` makes clips in which hands may fail; `policies`
-has policies with faults; `hand_motion` plans hands; `contact` and `support` move bodies; `bodies`,
-`hands` and `solids` have the geometry; `raycast` renders.
+Other modules: `dataset` makes shards; `attempts` makes clips in which hands may fail, `encounters`
+those in which they push, slip, hurry or are two, `idle` those in which they do nothing; `policies`
+has policies with faults; `hand_motion` plans hands; `contact`, `pushes` and `support` move bodies;
+`bodies`, `hands` and `solids` have the geometry; `raycast` renders.
 """
 
 from egosim_jax.worlds.tabletop.clips import (
     TabletopClip,
+    ground_truth_of,
+    observation_of,
     state_after,
     to_action,
     to_episode,
-    to_ground_truth,
-    to_known,
     to_triplet,
 )
 from egosim_jax.worlds.tabletop.scene import Scene, sample_scene
@@ -48,17 +49,17 @@ __all__ = [
     "TabletopClip",
     "World",
     "episode_of_sequence",
+    "ground_truth_of",
     "make_scene",
     "make_scripts",
     "make_sequence",
+    "observation_of",
     "read_scene",
     "sample_scene",
     "start_of_sequence",
     "state_after",
     "to_action",
     "to_episode",
-    "to_ground_truth",
-    "to_known",
     "to_triplet",
     "write_scene",
 ]

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
+from egosim_jax.rendering.mesh import vertex_normals
 from egosim_jax.types import InputError
 from egosim_jax.worlds.tabletop.primitives import cone, cuboid, cylinder, sphere, torus
 
@@ -40,6 +41,8 @@ TABLE_SIZE_M = (1.3, 0.62, 0.03)
 """Extent of the table top in meters."""
 REACH_M = (-0.20, 0.20, 0.15, 0.37)
 """Minimum and maximum x, then y, of placed bodies in meters: within view and reach."""
+HANDLE_M = 0.016
+"""Width of a handle between the fingertips, in meters."""
 LID_M = 0.012
 """Thickness of a chest's lid in meters; its hinge is at the far upper edge of the case."""
 
@@ -95,13 +98,7 @@ class Part:
     @cached_property
     def vertex_normals(self) -> Float32[np.ndarray, "v 3"]:
         """Area-weighted mean normal of the triangles of each vertex."""
-        a, b, c = (self.vertices_m[self.triangles[:, k]] for k in range(3))
-        faces = np.cross(b - a, c - a)
-        normals = np.zeros_like(self.vertices_m)
-        for k in range(3):
-            np.add.at(normals, self.triangles[:, k], faces)
-        length = np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
-        return (normals / length[:, None]).astype(np.float32)
+        return vertex_normals(self.vertices_m, self.triangles).astype(np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,6 +125,15 @@ class Body:
     def articulated(self) -> bool:
         """True for a body that is opened instead of carried."""
         return len(self.parts) > 1
+
+    @property
+    def grip_m(self) -> float:
+        """Width between the fingertips that grasp it, in meters: of a rim, a handle or the body."""
+        if self.articulated:
+            return HANDLE_M
+        if self.shape == "ring":
+            return self.size_m[2]
+        return 0.55 * self.size_m[0] if self.shape == "cone" else self.size_m[0]
 
 
 def box(
@@ -167,8 +173,8 @@ def split_edges(
     corners = np.argsort(triangles, axis=None, kind="stable")
     counts = np.bincount(triangles.ravel(), minlength=len(vertices))
     for vertex, around in enumerate(np.split(corners, np.cumsum(counts)[:-1])):
-        found = normals[around // 3]
-        near = found @ found.T > np.cos(np.radians(50))
+        of_corners = normals[around // 3]
+        near = of_corners @ of_corners.T > np.cos(np.radians(50))
         if near.all():  # as at most vertices of round bodies
             faces.flat[around] = len(points)
             points.append(vertices[vertex])

@@ -14,6 +14,8 @@ from typing import Literal, no_type_check
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
+from egosim_jax.data.clip_files import prior_column
+from egosim_jax.dynamics import predict
 from egosim_jax.geometry import pixel_rays, transform, upsample_intrinsics
 from egosim_jax.perception.oracle import motions_of
 from egosim_jax.perception.pipeline import Observation
@@ -22,6 +24,7 @@ from egosim_jax.rendering.mesh import Side, hand_mask
 from egosim_jax.rendering.mesh_reference import draw_mesh
 from egosim_jax.rendering.reference import draw_hands, render
 from egosim_jax.simulation.episode import Episode
+from egosim_jax.state.silhouettes import unmix_colors
 from egosim_jax.types import (
     JOINTS,
     Action,
@@ -42,8 +45,8 @@ POINTS_PER_PIXEL = 2
 POINT_PX = 1
 """Default side of the points of a rendered prior in pixels: the size for `tabletop`."""
 
-PriorName = Literal["state", "static"]
-"""Rendering of the scene: points of a state, or the scene as it was in the first frame."""
+PriorName = Literal["state", "predicted", "static"]
+"""Rendering of the scene: a state at rest, on predicted paths, or the exact first frame."""
 HandsName = Literal["skeleton", "mesh", "mask"]
 """Rendering of the hands: skeletons, shaded meshes, or the binary mask of the meshes."""
 
@@ -199,10 +202,11 @@ def first_view(scene: Scene, cameras: Cameras) -> tuple[Frame, SceneState]:
     rays = pixel_rays(intrinsics, height=height, width=width)
     points = transform(pose, rays[seen] * fine.depth_m[seen][:, None])
     ids = fine.ids[seen].astype(np.int32)
+    ids = np.where(ids < FIRST_BODY, 0, ids).astype(np.int32)
     return first, SceneState(
         points_m=points.astype(np.float32),
-        colors=fine.colors[seen],
-        object_ids=np.where(ids < FIRST_BODY, 0, ids).astype(np.int32),
+        colors=unmix_colors(points, fine.colors[seen], ids, pose, intrinsics),
+        object_ids=ids,
         last_seen=np.zeros(len(points), np.int32),
         intrinsics_px=cameras.intrinsics_px,
         names=scene.names(),
@@ -236,7 +240,9 @@ def to_triplet(
     `InputError` if the first frame shows no point, or for the mesh of a gripper.
     """
     # A static prior does not need this view, but every prior refuses a clip without points.
-    view = render(state or clip.state, clip.cameras, point_px=point_px)
+    start = state or clip.state
+    motion = predict(start, to_action(clip)) if prior == "predicted" else None
+    view = render(start, clip.cameras, point_px=point_px, motion=motion)
     frames, mask = view.frames, view.mask
     first = clip.first.colors if state is None else frames[0]
     if prior == "static":
@@ -254,7 +260,12 @@ def to_triplet(
         hands=hand_mask(drawn) if hands == "mask" else drawn,
         first_frame=first,
         target=clip.frames,
-        extra={"verb": clip.verb, "target": clip.target, "kind": clip.kind},
+        extra={
+            "verb": clip.verb,
+            "target": clip.target,
+            "kind": clip.kind,
+            **prior_column("predicted" if prior == "predicted" else "static"),
+        },
     )
 
 
@@ -299,13 +310,13 @@ def to_episode(clips: Sequence[TabletopClip], *, fps: int) -> Episode:
         actions=tuple(to_action(clip) for clip in clips),
         fps=fps,
         first_frame=clips[0].first.colors,
-        ground_truth=tuple(to_known(clip) for clip in clips),
+        ground_truth=tuple(ground_truth_of(clip) for clip in clips),
     )
 
 
-def to_known(clip: TabletopClip) -> GroundTruth:
+def ground_truth_of(clip: TabletopClip) -> GroundTruth:
     """Return the ground truth of a clip, in the form of an episode."""
-    truth = to_ground_truth(clip)
+    truth = observation_of(clip)
     return GroundTruth(
         frames=clip.frames,
         depth_m=truth.depth_m,
@@ -315,7 +326,7 @@ def to_known(clip: TabletopClip) -> GroundTruth:
     )
 
 
-def to_ground_truth(clip: TabletopClip) -> Observation:
+def observation_of(clip: TabletopClip) -> Observation:
     """Return the ground truth of a clip, in the form of a perception result."""
     # Hands have ids from 100 in renderings, and -1, -2, ... in an observation.
     ids = np.where(clip.ids >= FIRST_HAND, FIRST_HAND - 1 - clip.ids, clip.ids)

@@ -6,10 +6,9 @@ in straight lines, in steps of a few millimeters.
 - A closing hand grasps the body between its fingertips when both touch it. A loose body then moves
   rigidly with the hand; the handle of furniture follows the fingertips.
 - A hand that opens by `OPEN_M` releases its body, which settles (`support.settle`).
-- A joint that enters a body from the side pushes it; a joint that enters from above does not. A
-  pushed body translates and turns by the friction under its footprint. The limit surface is an
-  ellipsoid: a force f at r from the center gives the velocity v = f, w = (r x f) / c^2, with c the
-  radius of gyration of the pressure (Goyal, Ruina and Papadopoulos 1991).
+- Joints and long bones have flesh. Where it enters a body from the side it pushes it out
+  (`pushes`); from above it presses, and moves nothing. A hand pushes no body that it reaches
+  around, and none that it has just released, until it has left it.
 - A body in two hands moves with the first hand until that hand releases it.
 """
 
@@ -21,12 +20,13 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Bool, Float
 
-from egosim_jax.geometry import invert, rotation_z, transform
+from egosim_jax.geometry import invert, transform
 from egosim_jax.types import Kind
 from egosim_jax.worlds.tabletop.bodies import LID_M, Body
-from egosim_jax.worlds.tabletop.hands import frame_of, pinch, tips_of
-from egosim_jax.worlds.tabletop.scene import DRAWER_M, LID_DEGREES, Scene, moving_part
-from egosim_jax.worlds.tabletop.solids import surface_of
+from egosim_jax.worlds.tabletop.hands import FLESH_M, frame_of, opening_of, pinch, tips_of, touching
+from egosim_jax.worlds.tabletop.pushes import push_out, yields
+from egosim_jax.worlds.tabletop.scene import DRAWER_M, LID_DEGREES, Scene
+from egosim_jax.worlds.tabletop.solids import bodies_near, surface_of
 from egosim_jax.worlds.tabletop.support import (
     RANKS,
     min_opening,
@@ -41,24 +41,18 @@ PAD_M = 0.012
 """Maximum distance of a touching fingertip in meters: a finger's radius and compliance."""
 FIRM_M = 0.0005
 """Distance in meters at which fingertips hold a body, even while they still approach it."""
-BETWEEN_M = (0.001, 0.003)
-"""Minimum depth of the pinch point in meters: below the surface, and below both fingertips."""
+BETWEEN_M = 0.001
+"""Minimum depth of the pinch point in a grasped body, in meters."""
 OPEN_M = 0.002
 """Opening of the fingertips, from their closest, that releases a body, in meters."""
 SLIP_M = 0.03
 """Distance from the held point at which fingertips slip off, in meters."""
 LEAVE_M = (0.003, 0.010)
-"""Distances of a joint and of the pinch point that end a press, in meters."""
+"""Distances of flesh and of the pinch point that end a press, in meters."""
 STEP_M = 0.004
 """Maximum motion of a joint in one step, in meters."""
 MAX_STEPS = 64
 """Maximum number of steps between two frames."""
-FINGERS = [j for j in range(2, 21) if j % 4 != 1]
-"""Finger keypoints, without knuckles; an open hand's fingers do not push a body that fits in."""
-STEEP = 0.7
-"""Vertical component of a normal above which a joint presses instead of pushing."""
-GYRATION = 0.6
-"""Radius c of the limit surface, as a fraction of half a body's width."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +78,7 @@ class Contact:
     grasps: tuple[Grasp, ...] = ()
     """Bodies in hands; the first of two grasps of one body moves it."""
     pressing: frozenset[tuple[int, int, str]] = field(default_factory=frozenset)
-    """Hand, joint and body name of each joint inside a body that it does not push."""
+    """Hand, touching point and body name of flesh inside a body that it does not push."""
     closing: frozenset[int] = field(default_factory=frozenset)
     """Hands that closed in the last step."""
     released: frozenset[tuple[int, str]] = field(default_factory=frozenset)
@@ -95,7 +89,7 @@ class Contact:
         return next((grasp for grasp in self.grasps if grasp.name == name), None)
 
 
-def start(contact: Contact, joints_m: Float[np.ndarray, "n j 3"]) -> Contact:
+def start(contact: Contact, joints_m: Float[np.ndarray, "n j 3"], kind: Kind) -> Contact:
     """Return the contact at the first frame of an action, where hands may have jumped."""
     kept = [
         grasp
@@ -107,7 +101,7 @@ def start(contact: Contact, joints_m: Float[np.ndarray, "n j 3"]) -> Contact:
     contact = _release(contact, [grasp for grasp in contact.grasps if grasp not in kept])
     released = frozenset(pair for pair in contact.released if pair[0] < len(joints_m))
     contact = replace(contact, released=released)
-    return _appear(contact, joints_m, _present(joints_m))
+    return _appear(contact, joints_m, _present(joints_m), kind)
 
 
 def _present(joints_m: Float[np.ndarray, "n j 3"]) -> Bool[np.ndarray, " n"]:
@@ -116,15 +110,18 @@ def _present(joints_m: Float[np.ndarray, "n j 3"]) -> Bool[np.ndarray, " n"]:
 
 
 def _appear(
-    contact: Contact, joints_m: Float[np.ndarray, "n j 3"], hands: Bool[np.ndarray, " n"]
+    contact: Contact,
+    joints_m: Float[np.ndarray, "n j 3"],
+    hands: Bool[np.ndarray, " n"],
+    kind: Kind,
 ) -> Contact:
-    """Return the contact after hands appeared: joints inside bodies press and do not push."""
-    inside = {
-        (int(hand), int(joint), body.name)
-        for hand in np.flatnonzero(hands)
-        for body in contact.scene.bodies
-        for joint in np.flatnonzero(surface_of(contact.scene, body, joints_m[hand])[0] < 0)
-    }
+    """Return the contact after hands appeared: flesh inside bodies presses and does not push."""
+    inside = set()
+    for hand in np.flatnonzero(hands).tolist():
+        points, flesh = touching(joints_m[hand], kind), FLESH_M[kind]
+        for body in bodies_near(contact.scene, points, flesh):
+            touches = surface_of(contact.scene, body, points)[0] < flesh
+            inside |= {(hand, int(point), body.name) for point in np.flatnonzero(touches)}
     return replace(contact, pressing=contact.pressing | inside)
 
 
@@ -146,7 +143,7 @@ def advance(
         released=frozenset(pair for pair in contact.released if pair[0] not in gone),
     )
     if (after & ~before).any():
-        contact = _appear(contact, after_m, after & ~before)
+        contact = _appear(contact, after_m, after & ~before, kind)
     if not present.any():
         return contact
     length = np.linalg.norm(after_m[present] - before_m[present], axis=-1).max()
@@ -167,19 +164,13 @@ def _step(
         if pinch(after_m[grasp.hand])[1] > grasp.gap_m + OPEN_M
         or _slip_m(contact.scene, grasp, before_m[grasp.hand]) > SLIP_M
     ]
-    contact = _release(contact, opened, after_m)
+    contact = _release(contact, opened)
     ranks: dict[str, int] = {}  # of the bodies that move in this step
     contact = _follow(contact, after_m, kind, ranks)
     for hand in hands:
         contact = _grasp(contact, int(hand), before_m[hand], after_m[hand], kind)
-    released = {
-        (hand, name)
-        for hand, name in contact.released
-        if _distances(contact.scene, contact.scene.body(name), after_m[hand])[1] <= LEAVE_M[1]
-    }
-    contact = replace(contact, released=frozenset(released))
     for hand in hands:
-        contact = _push(contact, int(hand), after_m[hand], kind, ranks)
+        contact = _push(contact, int(hand), before_m[hand], after_m[hand], kind, ranks)
     if ranks:
         contact = _separate(contact, after_m, kind, ranks)
     return contact
@@ -191,23 +182,19 @@ def _slip_m(scene: Scene, grasp: Grasp, joints_m: Float[np.ndarray, "j 3"]) -> f
     return float(np.linalg.norm(held - pinch(joints_m)[0]))
 
 
-def _release(contact: Contact, grasps: list[Grasp], joints_m: np.ndarray | None = None) -> Contact:
+def _release(contact: Contact, grasps: list[Grasp]) -> Contact:
     """Release bodies; they settle unless another hand holds them."""
     if not grasps:
         return contact
     kept = tuple(grasp for grasp in contact.grasps if grasp not in grasps)
-    scene, pressing = contact.scene, set(contact.pressing)
+    scene = contact.scene
     for grasp in grasps:
         body = scene.body(grasp.name)
-        if joints_m is not None:  # the opening fingers are in the body, and must not push it
-            pressing |= {(grasp.hand, joint, body.name) for joint in range(joints_m.shape[1])}
         if any(other.name == grasp.name for other in kept):
             continue
         scene = _fall_shut(scene, body) if body.articulated else settle(scene, body.name)
     released = contact.released | {(grasp.hand, grasp.name) for grasp in grasps}
-    return replace(
-        contact, scene=scene, grasps=kept, pressing=frozenset(pressing), released=released
-    )
+    return replace(contact, scene=scene, grasps=kept, released=released)
 
 
 def _fall_shut(scene: Scene, body: Body) -> Scene:
@@ -277,8 +264,8 @@ def _grasp(
     contact = replace(contact, closing=others | {hand} if closing else others)
     if not (closing or closed) or any(grasp.hand == hand for grasp in contact.grasps):
         return contact
-    deepest, chosen = -BETWEEN_M[0], None
-    for body in contact.scene.bodies:
+    deepest, chosen = -BETWEEN_M, None
+    for body in bodies_near(contact.scene, pinch(after_m)[0][None], 0.0):
         last_tip, last_middle = _distances(contact.scene, body, before_m)
         tip, middle = _distances(contact.scene, body, after_m)
         # Fingers stop about their radius away from a surface: a hand that touches a body and gets
@@ -303,62 +290,52 @@ def _distances(scene: Scene, body: Body, joints_m: Float[np.ndarray, "j 3"]) -> 
 
 
 def _push(
-    contact: Contact, hand: int, joints_m: np.ndarray, kind: Kind, ranks: dict[str, int]
+    contact: Contact,
+    hand: int,
+    before_m: np.ndarray,
+    joints_m: np.ndarray,
+    kind: Kind,
+    ranks: dict[str, int],
 ) -> Contact:
-    """Move bodies out of the joints that enter them from the side."""
-    middle, gap = pinch(joints_m)
-    scene, pressing = contact.scene, set(contact.pressing)
-    for body in scene.bodies:
-        gaps = np.linalg.norm(joints_m - body.world_from_body[:3, 3], axis=1)
-        # A bounding sphere skips bodies out of reach.
-        if gaps.min() > np.linalg.norm(body.size_m) + DRAWER_M * body.articulated:
-            pressing = {key for key in pressing if key[0] != hand or key[2] != body.name}
+    """Move bodies out of the flesh that enters them from the side."""
+    points, flesh = touching(joints_m, kind), FLESH_M[kind]
+    way = points - touching(before_m, kind)
+    grasping, opening = np.stack([*tips_of(joints_m), pinch(joints_m)[0]]), opening_of(joints_m)
+    near = bodies_near(contact.scene, points, flesh + LEAVE_M[1])
+    names = {body.name for body in near}
+    scene = contact.scene
+    pressing = {key for key in contact.pressing if key[0] != hand or key[2] in names}
+    released = {pair for pair in contact.released if pair[0] != hand or pair[1] in names}
+    for body in near:
+        distance, normal, _ = surface_of(scene, body, np.concatenate([points, grasping]))
+        depth, distance = distance[-1], distance[:-3]
+        inside = distance < flesh
+        if depth > LEAVE_M[1]:
+            gone = np.flatnonzero(distance > flesh + LEAVE_M[0])
+            pressing -= {(hand, int(point), body.name) for point in gone}
+            if not inside.any():
+                released.discard((hand, body.name))
+        entering = [
+            int(point)
+            for point in np.flatnonzero(inside)
+            if (hand, int(point), body.name) not in pressing
+        ]
+        if not entering:
             continue
-        distance, normal, moving = surface_of(scene, body, joints_m)
-        *tips, depth = surface_of(scene, body, np.stack([*tips_of(joints_m), middle]))[0]
-        for joint in np.flatnonzero(distance > LEAVE_M[0]) if depth > LEAVE_M[1] else ():
-            pressing.discard((hand, int(joint), body.name))
-        between = depth < min(tips) - BETWEEN_M[1] or contact.holder(body.name) is not None
-        yielding = FINGERS if kind == "human" and gap > body.size_m[0] else ()
-        for joint in np.flatnonzero(distance < 0):
-            key = (hand, int(joint), body.name)
-            if key in pressing:
-                continue
-            steep = abs(normal[joint, 2]) > STEEP
-            if between or steep or joint in yielding or not moving[joint]:
-                pressing.add(key)
-                continue
-            scene = _push_out(scene, body.name, joints_m[joint])
-            ranks[body.name] = RANKS["pushed"]
-    return replace(contact, scene=scene, pressing=frozenset(pressing))
-
-
-def _push_out(scene: Scene, name: str, point_m: Float[np.ndarray, " 3"]) -> Scene:
-    """Move a body or its moving part until a point is not inside it."""
-    body = scene.body(name)
-    (distance,), (normal,), _ = surface_of(scene, body, point_m[None])
-    if distance >= 0:
-        return scene
-    if body.articulated:  # one Newton step, by a numerical derivative of the distance
-        step = 1e-3
-        local = invert(scene.first_part_pose(name)) @ [*point_m, 1.0]
-        ahead = moving_part(body, scene.openings[name] + step) @ local
-        speed = float(normal @ ((body.world_from_body @ ahead)[:3] - point_m)) / step
-        if abs(speed) < 1e-3:
-            return scene
-        opening = scene.openings[name] + distance / speed
-        return scene.with_opening(name, float(np.clip(opening, min_opening(scene, body), 1)))
-    force = -normal * [1, 1, 0] / max(float(np.linalg.norm(normal[:2])), 1e-9)
-    depth = -distance / max(float(np.linalg.norm(normal[:2])), 1e-9)
-    center = body.world_from_body[:3, 3]
-    lever = point_m - center
-    torque = float(lever[0] * force[1] - lever[1] * force[0])
-    square = (GYRATION * body.size_m[0] / 2) ** 2
-    amount = depth / (1 + torque**2 / square)
-    motion = np.eye(4)
-    motion[:3, :3] = rotation_z(amount * torque / square)
-    motion[:3, 3] = center + amount * force - motion[:3, :3] @ center
-    return move(scene, name, motion @ body.world_from_body)
+        pushed = scene
+        if (hand, body.name) in released or contact.holder(body.name) is not None:
+            presses = np.ones(len(entering), bool)
+        else:
+            closing, faces = hand in contact.closing, normal[-3:-1]
+            presses = yields(body, way, opening, faces, kind, closing=closing)[entering]
+            rest = np.flatnonzero(~presses)
+            pushed, presses[rest] = push_out(
+                scene, body.name, points[np.array(entering)[rest]], flesh
+            )
+        pressing |= {(hand, entering[index], body.name) for index in np.flatnonzero(presses)}
+        if pushed is not scene:
+            scene, ranks[body.name] = pushed, RANKS["pushed"]
+    return replace(contact, scene=scene, pressing=frozenset(pressing), released=frozenset(released))
 
 
 def _separate(contact: Contact, after_m: np.ndarray, kind: Kind, ranks: dict[str, int]) -> Contact:

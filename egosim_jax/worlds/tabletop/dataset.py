@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from egosim_jax.configs.model import ModelConfig
 from egosim_jax.data.clips import write_clips
 from egosim_jax.data.manifest import MANIFEST, read_manifest
 from egosim_jax.data.pack import triplet_record
@@ -118,6 +119,13 @@ class DatasetConfig:
             )
 
 
+def conditions_of(config: ModelConfig) -> tuple[PriorName, HandsName]:
+    """Return the renderings of scene and hands in a model's conditions."""
+    if config.layout.mask_packing == "observed":
+        return "static", "mesh"
+    return "predicted" if config.prior == "predicted" else "state", "skeleton"
+
+
 def write_scenes(
     folder: Path,
     seeds: Iterable[int],
@@ -160,11 +168,11 @@ def make_shards(
     parts = out / "parts"
     open_folder(out, config if states is true_states else {"dataset": config, "states": states})
     if (out / MANIFEST).exists():
-        found = read_manifest(out).grid
-        if found != grid:
+        written = read_manifest(out).grid
+        if written != grid:
             raise InputError(
                 f"{quote_path(out)} holds clips for another latent grid: it must be {grid}, not "
-                f"{found}. Choose another folder. (--out)"
+                f"{written}. Choose another folder. (--out)"
             )
         # A run may have been killed after it wrote the manifest and before it removed the parts.
         shutil.rmtree(parts, ignore_errors=True)

@@ -149,16 +149,20 @@ def lift(body: Body) -> Intent:
 
 def carry(body: Body, place_m: Float[np.ndarray, " 2"]) -> Intent:
     """Return the intent to carry a body to a place on the table."""
-    way = np.asarray(place_m) - body.world_from_body[:2, 3]
-    side = "right" if way[0] > 0 else "left"
-    depth = "to the back" if way[1] > 0 else "to the front"
-    words = f"to the {side}" if abs(way[0]) > abs(way[1]) else depth
+    words = direction(np.asarray(place_m) - body.world_from_body[:2, 3])
     return Intent(
         verb="carry",
         name=body.name,
         goal_m=np.array([*place_m, 0.0]),
         caption=f"picks up the {body.name} and puts it down {words}.",
     )
+
+
+def direction(way_m: Float[np.ndarray, " d"]) -> str:
+    """Return the words for a horizontal motion, such as "to the left"."""
+    if abs(way_m[0]) > abs(way_m[1]):
+        return "to the right" if way_m[0] > 0 else "to the left"
+    return "to the back" if way_m[1] > 0 else "to the front"
 
 
 def _loose_actions(scene: Scene, body: Body, rng: np.random.Generator) -> list[Intent]:
@@ -237,27 +241,33 @@ def grip_on(scene: Scene, intent: Intent, kind: Kind, side: Side) -> Grip:
         )
         local = moving_part(body, scene.openings[body.name]) @ [*handle, 1.0]
         point = (body.world_from_body @ local)[:3]
-        return Grip(point_m=point, yaw=0.0, pitch=np.radians(40), closure=closure_for(kind, 0.016))
-    width, offset = body.size_m[0], np.zeros(3)
-    height = 0.62 * body.size_m[2]
+        closure = closure_for(kind, body.grip_m)
+        return Grip(point_m=point, yaw=0.0, pitch=np.radians(40), closure=closure)
+    height, offset = (0.45 if body.shape == "cone" else 0.62) * body.size_m[2], np.zeros(3)
     if body.shape == "ring":  # the hand grasps its near rim
-        width, offset = body.size_m[2], np.array([0, -(body.size_m[0] - body.size_m[2]) / 2, 0])
-    if body.shape == "cone":
-        height, width = 0.45 * body.size_m[2], 0.55 * width
+        offset = np.array([0, -(body.size_m[0] - body.size_m[2]) / 2, 0])
     point = body.world_from_body[:3, 3] + offset + [0, 0, height]
-    return Grip(point_m=point, yaw=inward, pitch=np.radians(52), closure=closure_for(kind, width))
+    closure = closure_for(kind, body.grip_m)
+    return Grip(point_m=point, yaw=inward, pitch=np.radians(52), closure=closure)
 
 
 def act(
-    scene: Scene, hands: tuple[Hand, ...], intent: Intent, kind: Kind, *, frames: int
+    scene: Scene,
+    hands: tuple[Hand, ...],
+    intent: Intent,
+    kind: Kind,
+    *,
+    frames: int,
+    rises: bool = False,
 ) -> list[Moment]:
     """Return scene and hands at every frame of a clip; the first hand acts, the others rest.
 
     The first moment has the scene and hands of the arguments. The next clip starts from the last
-    moment.
+    moment. A hand that `rises` comes down on its target from above, wherever it starts; it would
+    push a tall body if it came from the side.
     """
     hand = hands[0]
-    keys = _keys(scene, hand, intent, kind)
+    keys = _keys(scene, hand, intent, kind, rises=rises)
     grasp = next(key.grip for key in keys if key.held)
     moments = []
     for time in np.linspace(0, 1, frames):
@@ -294,17 +304,25 @@ def opened(kind: Kind) -> float:
     return closure_for(kind, 0.085) if kind == "robot" else 0.12
 
 
-def _keys(scene: Scene, hand: Hand, intent: Intent, kind: Kind) -> list[_Key]:
+def _keys(
+    scene: Scene, hand: Hand, intent: Intent, kind: Kind, *, rises: bool = False
+) -> list[_Key]:
     """Return the keyframes of the acting hand."""
     start, grasp = hand.grip, grip_on(scene, intent, kind, hand.side)
     body, wide = scene.body(intent.name), opened(kind)
     above = replace(_shift(grasp, [0, -0.02, 0.03]), closure=wide)
     # A farther target takes longer to reach, so that no reach is much faster than others.
-    reach = 0.10 + 0.6 * min(0.4, float(np.linalg.norm(start.point_m - grasp.point_m)))
+    reach_m, rise_m = float(np.linalg.norm(start.point_m - grasp.point_m)), 0.0
+    ready = relaxed(grasp.point_m + BEFORE_M, hand.side, kind)
+    if rises and start.point_m[2] < ready.point_m[2]:
+        rise_m = float(np.linalg.norm(start.point_m - ready.point_m))
+        reach_m = rise_m + float(np.linalg.norm(BEFORE_M))
+    reach = 0.10 + 0.6 * min(0.4, reach_m)
     begin, end = reach + 0.10, 0.76
     first = scene.openings.get(intent.name, 0.0)
     keys = [
         _Key(time=0.0, grip=start, opening=first),
+        *([_Key(time=reach * rise_m / reach_m, grip=ready, opening=first)] if rise_m else []),
         _Key(time=reach, grip=above, opening=first),
         _Key(time=begin - CLOSE_SHARE, grip=replace(grasp, closure=wide), opening=first),
         _Key(time=begin, grip=grasp, held=True, opening=first),

@@ -11,11 +11,11 @@ from functools import cache
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from egosim_jax.rendering.mesh import Side
 from egosim_jax.rendering.skeleton import SKELETONS
-from egosim_jax.types import Kind
+from egosim_jax.types import JOINTS, Kind
 from egosim_jax.worlds.tabletop.bodies import Paint, Part, join
 from egosim_jax.worlds.tabletop.primitives import sphere
 
@@ -33,6 +33,12 @@ KNUCKLES = [5, 9, 13, 17]
 """Keypoints of the four knuckles."""
 GRIPPER_M = (0.12, 0.10)
 """Length of a gripper's fingers, and distance of its open tips, in meters."""
+PALM_M = 0.045
+"""Distance of a gripper's palm, where its jaws begin, from its wrist, in meters."""
+FLESH_M: dict[Kind, float] = {"human": 0.008, "robot": 0.006}
+"""Radius of the flesh around the bones of a hand, and of the jaws of a gripper, in meters."""
+SPACING_M = 0.03
+"""Maximum distance of touching points along a bone, in meters."""
 SKIN, SLEEVE, ENAMEL, RUBBER = (216, 150, 118), (72, 88, 112), (40, 150, 160), (52, 52, 56)
 """RGB colors of hand, forearm, gripper body and gripper fingers."""
 
@@ -84,6 +90,44 @@ def pinch(joints_m: Float[np.ndarray, "j 3"]) -> tuple[Float[np.ndarray, " 3"], 
     """Return the point between the grasping fingertips, and their distance, in meters."""
     thumb, fingers = tips_of(joints_m)
     return (thumb + fingers) / 2, float(np.linalg.norm(thumb - fingers))
+
+
+def opening_of(joints_m: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, " 3"]:
+    """Return the way from one grasping tip to the other in meters; 0 in a fist."""
+    thumb, fingers = tips_of(joints_m)
+    way = fingers - thumb
+    if len(joints_m) == JOINTS["human"]:  # the fingertips of a fist are behind the thumb's
+        way = way * float(way @ (joints_m[KNUCKLES].mean(axis=0) - joints_m[0]) > 0)
+    return way
+
+
+def touching(joints_m: Float[np.ndarray, "j 3"], kind: Kind) -> Float[np.ndarray, "p 3"]:
+    """Return the points of a hand that touch bodies: its joints, then points along long bones."""
+    return _along_bones(kind) @ joints_m
+
+
+@cache
+def fingers_of(kind: Kind) -> Bool[np.ndarray, " p"]:
+    """Return which touching points are on fingers or jaws, and not on the palm."""
+    palm = [0, 1, *KNUCKLES] if kind == "human" else [0]
+    return _along_bones(kind)[:, palm].sum(axis=1) < 1 - 1e-9
+
+
+@cache
+def _along_bones(kind: Kind) -> Float[np.ndarray, "p j"]:
+    """Return the weights of the joints in each touching point."""
+    joints, rows = joints_of(kind, 0.0, "right"), np.eye(JOINTS[kind])
+    if kind == "human":
+        ends = [(rows[a], rows[b]) for a, b in SKELETONS["human"].bones]
+    else:  # the jaws are parallel, from the palm to the tips
+        palm = (1 - PALM_M / GRIPPER_M[0]) * (rows[0] - (rows[1] + rows[2]) / 2)
+        ends = [(tip + palm, tip) for tip in rows[1:]]
+    points = list(rows)
+    for first, last in ends:
+        length = float(np.linalg.norm((last - first) @ joints))
+        shares = np.linspace(0, 1, int(np.ceil(length / SPACING_M)) + 1)[1:-1]
+        points += [first + share * (last - first) for share in shares]
+    return np.array(points)
 
 
 def frame_of(joints_m: Float[np.ndarray, "j 3"], kind: Kind) -> Float[np.ndarray, "4 4"]:
@@ -154,7 +198,7 @@ def hand_meshes(
         across = across / max(np.linalg.norm(across), 1e-9)
         along = (left + right) / 2 - wrist
         along = along / np.linalg.norm(along)
-        knuckle = wrist + 0.045 * along
+        knuckle = wrist + PALM_M * along
         fingers = [
             _limb(knuckle + across * ((tip - knuckle) @ across), tip, 0.012, 0.010)
             for tip in (left, right)

@@ -12,13 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from einops import rearrange, reduce
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 
 from egosim_jax.geometry import pixel_rays, transform, upsample_intrinsics
 from egosim_jax.types import InputError
 from egosim_jax.worlds.tabletop.bodies import Part
-from egosim_jax.worlds.tabletop.embree import Hits, rays_among
-from egosim_jax.worlds.tabletop.primitives import Mesh
+from egosim_jax.worlds.tabletop.embree import Hits, Rays
 
 SUN = np.array([-0.25, -0.50, 0.83])
 """Direction towards the light, behind the wearer's left shoulder."""
@@ -61,11 +60,12 @@ class RayCaster:
 
     def __init__(self, placed: Sequence[Placed]):
         self.placed = list(placed)
-        self.meshes: list[Mesh] = [
-            (transform(item.world_from_part, item.part.vertices_m), item.part.triangles)
-            for item in self.placed
-        ]
-        self.rays = rays_among(self.meshes)
+        self.rays = Rays(
+            [
+                (transform(item.world_from_part, item.part.vertices_m), item.part.triangles)
+                for item in self.placed
+            ]
+        )
 
     def render(
         self,
@@ -87,8 +87,7 @@ class RayCaster:
         )
 
     def _refuse_inside(self, eye_m: np.ndarray) -> None:
-        """Raise `InputError` if a ray upwards crosses surfaces an odd number of times."""
-        if sum(crossings_above(eye_m, *mesh) for mesh in self.meshes) % 2:
+        if self.rays.contain(eye_m):
             place = ", ".join(f"{value:.3f}" for value in eye_m)
             raise InputError(
                 f"The camera at ({place}) m is inside an object; it must be outside all objects. "
@@ -111,7 +110,7 @@ class RayCaster:
         # Shadow rays start 1 mm off the surface, which would otherwise shadow itself.
         lit, faces_sun = np.zeros(len(points), bool), (cosine > 0) & ~sky
         starts = points[faces_sun] + np.float32(1e-3) * normals[faces_sun]
-        lit[faces_sun] = ~self._shadowed(starts, sun)
+        lit[faces_sun] = ~self.rays.blocked(starts, np.broadcast_to(sun, starts.shape))
         light = albedo * (AMBIENT + SUNLIGHT * cosine * lit)[:, None]
         light[sky] = SKY
         light = reduce(light, "(h y w x) c -> h w c", "mean", h=height, w=width, y=RAYS, x=RAYS)
@@ -138,35 +137,9 @@ class RayCaster:
                 normals[hit] = mixed / length[:, None] @ pose[:3, :3].T
         return albedo, normals
 
-    def _shadowed(
-        self, points: Float32[np.ndarray, "n 3"], sun: Float32[np.ndarray, " 3"]
-    ) -> Bool[np.ndarray, " n"]:
-        return self.rays.blocked(points, np.broadcast_to(sun, points.shape))
-
     def _cast(self, pose: np.ndarray, rays: Float32[np.ndarray, "n 3"]) -> Hits:
         """Cast rays from the camera."""
         return self.rays.cast(np.broadcast_to(pose[:3, 3].astype(np.float32), rays.shape), rays)
-
-
-def crossings_above(
-    point_m: Float[np.ndarray, " 3"],
-    vertices_m: Float[np.ndarray, "v 3"],
-    triangles: Int[np.ndarray, "t 3"],
-) -> int:
-    """Return how many triangles of a mesh are above a point."""
-    low, high = vertices_m.min(axis=0), vertices_m.max(axis=0)
-    if (point_m[:2] < low[:2]).any() or (point_m > high).any():
-        return 0
-    x, y, z = np.moveaxis((vertices_m - point_m)[triangles], -1, 0)
-    x_next, y_next = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
-    # Seen from above, the point is in a triangle if one edge crosses the half line along +x from
-    # it. Signs round alike for both triangles of an edge, so exactly one of them has its points.
-    areas = x * y_next - x_next * y  # twice, with the edge from each corner to the next
-    crossed = ((y > 0) != (y_next > 0)) & ((areas > 0) == (y_next > y)) & (areas != 0)
-    whole = areas.sum(axis=1)
-    inside = (crossed.sum(axis=1) == 1) & (whole != 0)
-    heights = (np.roll(areas, -1, axis=1) * z)[inside].sum(axis=1) / whole[inside]
-    return int((heights > 0).sum())
 
 
 def _world_rays(

@@ -89,12 +89,12 @@ class Scene:
 
     def names(self) -> dict[int, str]:
         """Return the names of all bodies and cases by instance id."""
-        found = {}
+        names = {}
         for body in self.bodies:
-            found[self.instance_id(body.name)] = body.name
+            names[self.instance_id(body.name)] = body.name
             if body.articulated:
-                found[self.instance_id(body.name) + 1] = f"case of the {body.name}"
-        return found
+                names[self.instance_id(body.name) + 1] = f"case of the {body.name}"
+        return names
 
     def first_part_pose(self, name: str) -> Float[np.ndarray, "4 4"]:
         """Return the pose of a body or, if it is articulated, of its moving part."""

@@ -254,13 +254,13 @@ def read_scene(path: Path | str) -> Scene:
 
 
 def _object(item: Any) -> Object:
-    known = [field.name for field in dataclasses.fields(Object)]
-    unknown = sorted(item.keys() - set(known)) if isinstance(item, dict) else [item]
+    names = [field.name for field in dataclasses.fields(Object)]
+    unknown = sorted(item.keys() - set(names)) if isinstance(item, dict) else [item]
     if unknown or not {"shape", "color"} <= item.keys():
         wrong = quote(unknown[0]) if unknown else "no shape or color"
         raise InputError(
             f"An object is {quote(item)} with {wrong}: it must have shape and color, and may have "
-            f"{', '.join(known[2:])}."
+            f"{', '.join(names[2:])}."
         )
     values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in item.items()}
     return Object(**values)

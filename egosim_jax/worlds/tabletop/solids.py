@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 
 from egosim_jax.geometry import invert, transform
 from egosim_jax.worlds.tabletop.bodies import LID_M, Body, Shape
-from egosim_jax.worlds.tabletop.scene import Scene
+from egosim_jax.worlds.tabletop.scene import DRAWER_M, Scene
 
 Form = Literal["box", "cylinder", "ball", "cone", "ring"]
 
@@ -120,14 +120,26 @@ def surface_of(
 
     With `handle`, only the handle of furniture counts; a loose body counts completely.
     """
-    found = []
+    solids = []
     for solid in solids_of(body.shape, body.size_m):
         if handle and body.articulated and not solid.handle:
             continue
         moving = solid.part == 0
         pose = scene.first_part_pose(body.name) if moving else body.world_from_body
         distance, normal = solid.at(transform(invert(pose), points_m))
-        found.append((distance, normal @ pose[:3, :3].T, np.full(len(points_m), moving)))
-    distances = np.stack([distance for distance, *_ in found])
+        solids.append((distance, normal @ pose[:3, :3].T, np.full(len(points_m), moving)))
+    distances = np.stack([distance for distance, *_ in solids])
     nearest, index = distances.argmin(axis=0), np.arange(len(points_m))
-    return tuple(np.stack(values)[nearest, index] for values in zip(*found, strict=True))  # type: ignore[return-value]
+    return tuple(np.stack(values)[nearest, index] for values in zip(*solids, strict=True))  # type: ignore[return-value]
+
+
+def bodies_near(scene: Scene, points_m: Float[np.ndarray, "p 3"], margin_m: float) -> list[Body]:
+    """Return the bodies that may be nearer to a point than the margin, by bounding spheres."""
+    centers = np.array([body.world_from_body[:3, 3] for body in scene.bodies]).reshape(-1, 3)
+    gaps = points_m[:, None] - centers
+    nearest = np.sqrt((gaps**2).sum(axis=-1).min(axis=0))
+    return [
+        body
+        for body, gap in zip(scene.bodies, nearest, strict=True)
+        if gap < np.linalg.norm(body.size_m) + DRAWER_M * body.articulated + margin_m
+    ]

@@ -15,7 +15,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
-from egosim_jax.geometry import invert, transform
+from egosim_jax.geometry import invert, smallest_rotation, transform
 from egosim_jax.worlds.tabletop.bodies import LID_M, TABLE_SIZE_M, Body
 from egosim_jax.worlds.tabletop.scene import LID_DEGREES, Scene
 from egosim_jax.worlds.tabletop.solids import Solid, solids_of
@@ -65,7 +65,7 @@ def footprints(scene: Scene, body: Body) -> list[Footprint]:
     """Return the footprints of a body; a cabinet has one of its case and one of its open drawer."""
     if not body.articulated:
         return [_footprint(body)]
-    found = []
+    outlines = []
     for solid in solids_of(body.shape, body.size_m):
         moving = solid.part == 0
         if solid.handle or (
@@ -77,8 +77,8 @@ def footprints(scene: Scene, body: Body) -> list[Footprint]:
             y = body.size_m[1]
             solid = Solid(form="box", size_m=(solid.size_m[0], y, solid.size_m[2]),
                           origin_m=(0.0, -0.006, solid.origin_m[2]))  # fmt: skip
-        found.append(_box_footprint(solid, pose))
-    return found
+        outlines.append(_box_footprint(solid, pose))
+    return outlines
 
 
 def _footprint(body: Body) -> Footprint:
@@ -179,10 +179,10 @@ def support_below(scene: Scene, body: Body) -> tuple[float, str | None]:
 def _tops(scene: Scene, body: Body) -> list[Footprint]:
     """Return the flat upper sides of a body; a ball, a cone or a tilted cylinder has none."""
     if body.articulated:
-        found = footprints(scene, body)
+        outlines = footprints(scene, body)
         if body.shape == "lidded box" and scene.openings[body.name] < LID_OPEN:
-            return [replace(found[0], high_m=body.world_from_body[2, 3] + body.size_m[2])]
-        return found
+            return [replace(outlines[0], high_m=body.world_from_body[2, 3] + body.size_m[2])]
+        return outlines
     upright = abs(body.world_from_body[2, 2]) > UPRIGHT
     flat = body.shape == "box" or (upright and body.shape in ("cylinder", "cup", "ring"))
     return footprints(scene, body) if flat else []
@@ -199,21 +199,21 @@ def _contains(outline: Footprint, point_m: Float[np.ndarray, " 2"]) -> bool:
 
 def supporters(scene: Scene) -> dict[str, str]:
     """Return the supporting body of each loose body by name, without bodies on the table."""
-    found = {}
+    supports = {}
     for body in scene.bodies:
         if not body.articulated:
             height, name = support_below(scene, body)
             if name is not None and abs(bottom_and_top(body)[0] - height) < TOUCH_M:
-                found[body.name] = name
-    return found
+                supports[body.name] = name
+    return supports
 
 
 def riders(scene: Scene, name: str) -> list[str]:
     """Return the names of the bodies that rest on a body, directly or on others."""
-    found, resting_on = [name], supporters(scene)
-    for below in found:
-        found += [top for top, under in resting_on.items() if under == below and top not in found]
-    return found[1:]
+    names, resting_on = [name], supporters(scene)
+    for below in names:
+        names += [top for top, under in resting_on.items() if under == below and top not in names]
+    return names[1:]
 
 
 def move(scene: Scene, name: str, world_from_body: Float[np.ndarray, "4 4"]) -> Scene:
@@ -248,11 +248,11 @@ def push_aside(scene: Scene, ranks: Mapping[str, int]) -> tuple[Scene, set[str]]
             low, high = sorted((second, first), key=lambda name: ranks[name])
             if ranks[high] == 0 or ranks[low] == RANKS["furniture"]:
                 continue
-            found = _apart(scene, low, high)
-            if found is None:
+            way = _apart(scene, low, high)
+            if way is None:
                 continue
             moved |= {low, *riders(scene, low)}
-            scene = shift(scene, low, found)
+            scene = shift(scene, low, way)
             ranks[low] = max(ranks[low], RANKS["pushed"])  # it now pushes bodies at rest
             again = True
         if not again:
@@ -273,8 +273,8 @@ def _apart(scene: Scene, low: str, high: str) -> Float[np.ndarray, " 2"] | None:
         return inner if deep and np.abs(inner).max() > OVERLAP_M else None
     outline = footprints(scene, body)[0]
     ways = [separation(outline, f) for f in footprints(scene, other)]
-    found = [way for way in ways if way is not None]
-    return max(found, key=lambda way: float(np.linalg.norm(way))) if found else None
+    overlaps = [way for way in ways if way is not None]
+    return max(overlaps, key=lambda way: float(np.linalg.norm(way))) if overlaps else None
 
 
 def settle(scene: Scene, name: str) -> Scene:
@@ -298,10 +298,10 @@ def settle(scene: Scene, name: str) -> Scene:
         pose[2, 3] += height - bottom_and_top(body)[0]
         scene = scene.with_pose(name, pose)
         ways = [_apart(scene, name, other.name) for other in scene.bodies if other.name != name]
-        found = [way for way in ways if way is not None]
-        if not found:
+        overlaps = [way for way in ways if way is not None]
+        if not overlaps:
             break
-        scene = shift(scene, name, found[0])  # it slides off bodies that do not support it
+        scene = shift(scene, name, overlaps[0])  # it slides off bodies that do not support it
     return scene
 
 
@@ -323,14 +323,7 @@ def stable_rotation(body: Body) -> Float[np.ndarray, "3 3"]:
     elif body.shape in ("cylinder", "cup"):
         candidates.append(side)
     best = max(candidates, key=lambda way: float(way @ down))
-    return _rotation_between(rotation @ best, np.array([0, 0, -1.0])) @ rotation
-
-
-def _rotation_between(a: np.ndarray, b: np.ndarray) -> Float[np.ndarray, "3 3"]:
-    """Return the smallest rotation from one unit vector to another; they must not be opposite."""
-    x, y, z = np.cross(a, b)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + cross + cross @ cross / (1 + a @ b)
+    return smallest_rotation((rotation @ best)[None], np.array([[0, 0, -1.0]]))[0] @ rotation
 
 
 def min_opening(scene: Scene, chest: Body) -> float:

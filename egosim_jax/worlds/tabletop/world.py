@@ -61,7 +61,7 @@ class World:
                 f"joints_m is {joints.shape}: {action.kind} hands of a path of {frames} cameras "
                 f"must be ({frames}, hands, {number}, 3). Give as many frames as cameras."
             )
-        contact = start(Contact(scene=self.scene, grasps=self.grasps), joints[0])
+        contact = start(Contact(scene=self.scene, grasps=self.grasps), joints[0], action.kind)
         scenes = [contact.scene]
         for before, after in pairwise(joints):
             contact = advance(contact, before, after, action.kind)

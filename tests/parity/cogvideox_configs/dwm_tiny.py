@@ -5,8 +5,8 @@ from egosim_jax.conditioning.text import BYT5_VOCAB, PromptTokenizer
 from egosim_jax.configs.model import ModelConfig
 from egosim_jax.diffusion import DDIM, Guidance, VariancePreserving
 from egosim_jax.models.cogvideox.dit import CogVideoXDiTConfig
-from egosim_jax.models.cogvideox.t5 import T5Config
 from egosim_jax.models.cogvideox.vae import CogVideoXVAEConfig
+from egosim_jax.models.t5 import T5Config
 from egosim_jax.types import VideoSpec
 
 CONFIG = ModelConfig(

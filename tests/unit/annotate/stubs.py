@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 
 from egosim_jax.annotate.config import AnnotateConfig, Estimators
-from egosim_jax.io.video import write_video
-from egosim_jax.perception.estimates import CameraEstimate, DepthEstimate, HandTracks, Verdict
+from egosim_jax.io.writing import write_video
+from egosim_jax.perception.video.estimates import CameraEstimate, DepthEstimate, HandTracks, Verdict
 from egosim_jax.types import Cameras
 
 FOCAL = 50.0

@@ -15,7 +15,7 @@ from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.io.video import read_video
 from tests.unit.annotate.stubs import StubHands, write
 from tests.unit.annotate.test_run import annotate
-from tests.unit.perception.cameras import room
+from tests.unit.perception.video.cameras import room
 
 ARRAYS = {"world_from_camera": "float64", "intrinsics_px": "float64", "joints_m": "float64"}
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from fractions import Fraction
 
+import cv2
 import numpy as np
 import pytest
 
@@ -14,6 +15,7 @@ from egosim_jax.data.recording import Recording
 from egosim_jax.io.bounded import read_json
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.state import snapshot
+from egosim_jax.types import InputError
 from tests.unit.annotate.stubs import DEPTH, config, mean_hand, textured_video, write
 from tests.unit.annotate.test_run import annotate
 
@@ -89,6 +91,53 @@ def test_measured_depth_gives_the_scene_and_the_scale(recording, tmp_path):
     assert about["cameras"]["focal_source"] == "recording"
     assert about["cameras"]["focal_px"] == 60
     assert np.allclose(snapshot.load(out / "take/state").points_m[:, 2], 0.7)
+
+
+def with_depth(recording, folder, at_m, unit_m, numbers=range(17)):
+    for number in numbers:
+        path = folder / f"{number:06d}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), np.full((24, 40), round(at_m / unit_m), np.uint16))
+    paths = tuple(folder / f"{n:06d}.png" for n in range(17))
+    return replace(recording, depth=DepthFiles(paths=paths, unit_m=0.001))
+
+
+@pytest.mark.parametrize("unit_m", [0.001, 0.0001, 0.00025, 0.01])
+def test_depth_of_another_unit_contradicts_the_hands(recording, tmp_path, unit_m):
+    """The hand is at .6 m, and the depth at its pixels is .62 m."""
+    known = with_depth(recording, tmp_path / "depth", 0.62, unit_m)
+    known.save(tmp_path / "imported/take")
+    for given in (None, unit_m):
+        out = tmp_path / f"out_{given}"
+        report = annotate([tmp_path / "imported"], out, config(depth_unit_m=given))
+        (about,) = report["annotations"]
+        if given or unit_m == 0.001:
+            assert about["status"] == "done"
+            assert np.allclose(snapshot.load(out / "take/state").points_m[:, 2], 0.62, atol=0.01)
+        else:
+            assert (about["status"], about["rule"]) == ("refused", "depth")
+            assert "(--depth-unit)" in about["reason"]
+
+
+@pytest.mark.parametrize(
+    ("numbers", "first"),
+    [(range(17), 0), (range(1, 18), 1), (range(100, 117), 100), ([*range(16)], 0), ([0, 8, 16], 0)],
+)
+def test_depth_files_are_shifted_to_the_first_frame(recording, tmp_path, caplog, numbers, first):
+    with_depth(recording, tmp_path / "depth/take", 0.62, 0.001, numbers)
+    replace(recording, joints_m=None).save(tmp_path / "imported")
+    opened = open_source(Source(name="take", path=tmp_path / "imported"), tmp_path / "depth")
+    found = {n + first for n, path in enumerate(opened.depth.paths) if path is not None}
+    assert found == set(numbers)
+    assert ("is used for frame 0" in caplog.text) == (first > 0)
+
+
+@pytest.mark.parametrize("numbers", [range(1, 17), range(14), range(20), range(5, 25), [0, 9, 18]])
+def test_depth_files_of_other_numbers_are_refused(recording, tmp_path, numbers):
+    with_depth(recording, tmp_path / "depth/take", 0.62, 0.001, numbers)
+    recording.save(tmp_path / "imported")
+    with pytest.raises(InputError, match="17 frames"):
+        open_source(Source(name="take", path=tmp_path / "imported"), tmp_path / "depth")
 
 
 def test_given_depth_is_numbered_by_the_frames_of_the_video(recording, tmp_path):

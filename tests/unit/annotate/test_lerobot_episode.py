@@ -13,8 +13,9 @@ from egosim_jax.annotate.lerobot_episode import episode_from_lerobot
 from egosim_jax.data.lerobot_writer import HANDS, POSES
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.single import WorldEnv
+from egosim_jax.interactive.options import Limits
 from egosim_jax.interactive.server import dataset_export
-from egosim_jax.interactive.server.store import Limits, Store
+from egosim_jax.interactive.server.store import Store
 from egosim_jax.state import snapshot
 from egosim_jax.types import InputError
 from tests.painted import VIDEO, painted
@@ -101,7 +102,7 @@ def test_rows_are_taken_by_their_time_stamps(recorded, tmp_path):
         ({"number": 7}, "no episode 7 among its 1"),
         ({"clips": 3}, "enough for 2 clips"),
         ({"scene": None}, "no scene of this episode"),
-        ({"fps": 0}, "not a rate"),
+        ({"fps": 0}, "must be above 0"),
     ],
 )
 def test_a_dataset_without_what_an_episode_needs_is_refused(recorded, tmp_path, change, message):

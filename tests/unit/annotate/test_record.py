@@ -8,7 +8,7 @@ import pytest
 from egosim_jax.annotate import record as records
 from egosim_jax.annotate.clip import Job, open_record
 from egosim_jax.annotate.sources import find_sources, open_source
-from egosim_jax.perception.estimates import SparsePoints
+from egosim_jax.perception.video.estimates import SparsePoints
 from egosim_jax.types import InputError
 from tests.unit.annotate.stubs import StubCameras, StubHands, config, textured_video, write
 

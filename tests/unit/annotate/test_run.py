@@ -1,6 +1,7 @@
 """Annotation of videos, from files to metadata.csv."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -139,12 +140,6 @@ def test_hands_that_come_late_can_be_accepted(video, tmp_path):
     assert none["annotations"][0]["scale"]["source"] == "median depth"
 
 
-def test_all_hands_can_be_put_on_one_side(video, tmp_path):
-    out = tmp_path / "out"
-    annotate([video], out, config(side="left"))
-    assert read_json(out / "cup" / ANNOTATION)["hands"]["frames"] == {"left": 17, "right": 0}
-
-
 def test_one_bad_video_does_not_stop_the_others(video, tmp_path):
     (tmp_path / "bad.mp4").write_bytes(b"not a video")
     write(tmp_path / "short.mp4", textured_video(5))
@@ -163,6 +158,26 @@ def test_a_bad_video_that_was_replaced_is_annotated(tmp_path):
     report = annotate([bad], out)
     assert report["clips"]["done"] == 1
     assert "problem" not in report["videos"]["cup"]
+
+
+def test_a_second_video_is_added_to_the_first(video, tmp_path):
+    out = tmp_path / "out"
+    annotate([video], out)
+    (tmp_path / "bad.mp4").write_bytes(b"no video")
+    annotate([tmp_path / "bad.mp4"], out)
+    report = annotate([write(tmp_path / "jug.mp4", textured_video(17))], out)
+    assert report["clips"]["done"] == 2
+    assert list(report["videos"]) == ["jug", "bad", "cup"]
+    assert [files.video_id for files in read_metadata(out / "metadata.csv")] == ["cup", "jug"]
+    assert read_json(out / "report.json") == report
+
+
+def test_the_rest_of_a_longer_video_is_named(video, tmp_path):
+    settings = config(sampling=Sampling(num_frames=9))
+    note = annotate([video], tmp_path / "out", settings)["videos"]["cup"]["note"]
+    assert "of 17 frames at 16 fps, the first 9 are one clip" in note
+    assert note == annotate([video], tmp_path / "out", settings)["videos"]["cup"]["note"]
+    assert "note" not in annotate([video], tmp_path / "all")["videos"]["cup"]
 
 
 def test_another_configuration_in_the_same_folder_is_refused(video, tmp_path):
@@ -195,6 +210,30 @@ def test_finished_stages_and_clips_are_not_repeated(video, tmp_path, monkeypatch
     before = (out / "report.json").read_bytes()
     annotate([video], out, settings)
     assert (out / "report.json").read_bytes() == before
+
+
+def test_an_interrupted_run_continues_after_its_folder_was_moved(video, tmp_path, monkeypatch):
+    log = tmp_path / "calls"
+    settings = config(log=log)
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "annotate_jobs", lambda *_, **__: [][1])
+        with pytest.raises(IndexError):
+            annotate([video], tmp_path / "out", settings)
+    (tmp_path / "out").rename(tmp_path / "moved")
+    assert annotate([video], tmp_path / "moved", settings)["clips"]["done"] == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_pipes_are_named_and_hidden_folders_skipped(video, tmp_path):
+    (tmp_path / "set/.fold.0123456789abcdef.tmp").mkdir(parents=True)
+    video.rename(tmp_path / "set/.fold.0123456789abcdef.tmp/video.mp4")
+    with pytest.raises(InputError, match="holds no video"):
+        find_sources([tmp_path / "set"])
+    os.mkfifo(tmp_path / "set/pipe.mp4")
+    (tmp_path / "set/link.mp4").symlink_to(tmp_path / "missing")
+    videos = annotate([tmp_path / "set"], tmp_path / "out")["videos"]
+    assert "not a regular file" in videos["pipe"]["problem"]
+    assert "No such file" in videos["missing"]["problem"]
 
 
 def test_a_defect_is_reported_for_its_clip_alone_and_tried_again(video, tmp_path, monkeypatch):

@@ -20,8 +20,8 @@ from egosim_jax.annotate.scene import (
 )
 from egosim_jax.annotate.sources import Source, open_source
 from egosim_jax.annotate.stages import find_hands, search_hands
-from egosim_jax.perception.estimates import LEFT, RIGHT
-from egosim_jax.perception.moved import Moved
+from egosim_jax.perception.video.estimates import LEFT, RIGHT
+from egosim_jax.perception.video.moved import Moved
 from tests.unit.annotate.stubs import StubHands, config, textured_video, write
 
 
@@ -79,11 +79,6 @@ def test_a_hand_that_enters_hides_nothing_of_the_first_frame(shown, absent):
     assert held[0, RIGHT] != absent
     assert held[1:, RIGHT].all()
     assert not before_entry(StubHands(1.0, None)(frames), frames).any()
-
-
-def test_a_video_without_hands_holds_none():
-    hands = StubHands(0.0, None)(np.zeros((9, 48, 80, 3), np.uint8))
-    assert not visible(hold_hands(hands, Fraction(16))).any()
 
 
 def test_a_prior_that_is_worse_than_the_first_frame_is_refused():
@@ -154,7 +149,7 @@ def test_moved_objects_get_ids_and_sleeves_are_arms(tmp_path, monkeypatch):
         )
         for n, mask in enumerate(shown)
     ]
-    monkeypatch.setattr("egosim_jax.perception.moved.find_moved", lambda *_, **__: found)
+    monkeypatch.setattr("egosim_jax.perception.video.moved.find_moved", lambda *_, **__: found)
     settings = config()
     record = find_moved_objects(record, settings.build(), settings)
     ids = record.require("object_ids")

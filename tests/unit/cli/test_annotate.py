@@ -1,20 +1,10 @@
 """`egosim data annotate` and `egosim episode from-annotation`."""
 
-from dataclasses import replace
-from pathlib import Path
-
 import pytest
 
-from egosim_jax.annotate import run
-from egosim_jax.annotate.clip import ANNOTATION
 from egosim_jax.annotate.config import AnnotateConfig
 from egosim_jax.cli.__main__ import main
-from egosim_jax.cli.annotate import Annotate
-from egosim_jax.io.bounded import read_json
-from egosim_jax.io.run import plain
-from egosim_jax.perception.cameras import CameraLadder
 from egosim_jax.runtime.command import ExitCode
-from egosim_jax.runtime.options import option_of, show_options
 from egosim_jax.simulation.episode import Episode
 from tests.unit.annotate.stubs import config, textured_video, write
 
@@ -59,20 +49,6 @@ def test_a_video_without_clips_is_named_with_its_reason(video, tmp_path, capsys)
     assert "1 clip done, 0 refused, 0 failed; of 2 videos, 1 without a clip" in shown
 
 
-@pytest.mark.parametrize("options", [[], ["--focal", "120"]])
-def test_an_assumed_focal_length_is_said(video, tmp_path, capsys, monkeypatch, options):
-    focal = 120.0 if options else None
-    parts = replace(config().build(), cameras=CameraLadder(rung="static", focal_px=focal))
-    monkeypatch.setattr(AnnotateConfig, "build", lambda self: parts)
-    monkeypatch.setattr(run, "_built", {})
-    out = tmp_path / "out"
-    command = ["data", "annotate", str(video), "--out", str(out), *OPTIONS, *options]
-    assert main(command) == ExitCode.DONE
-    said = "1 clip without a known focal length: a view of 90" in capsys.readouterr().err
-    source = read_json(out / "cup" / ANNOTATION)["cameras"]["focal_source"]
-    assert (said, source) == ((False, "--focal") if options else (True, "assumed"))
-
-
 def test_a_models_clips_have_its_size_rate_and_length(video, tmp_path):
     out = tmp_path / "out"
     command = ["data", "annotate", str(video), "--out", str(out), "--config", "real_tiny"]
@@ -85,9 +61,7 @@ def test_a_models_clips_have_its_size_rate_and_length(video, tmp_path):
     [
         (["--clips"], "--clips needs the length"),
         (["--depth", "magic"], "--depth 'magic' must be one of sweep, depth-anything=FOLDER"),
-        (["--depth", "depth-pro=none"], "is not a folder"),
         (["--masks", "grounded-sam3=."], "belong together"),
-        (["--detector", "."], "belong together"),
         (["--scale", "2", "--camera-height", "1"], "choose one"),
         (["--focal", "-3"], "--focal is -3"),
         (["--workers", "0"], "--workers must be at least 1"),
@@ -99,22 +73,3 @@ def test_wrong_options_are_refused_before_any_work(video, tmp_path, capsys, opti
     assert code == ExitCode.USAGE
     assert message in capsys.readouterr().err
     assert not (out / "work").exists()
-
-
-def test_another_configuration_is_refused_by_the_options_as_they_are_typed(video, tmp_path, capsys):
-    again = ["data", "annotate", str(video), "--out", str(tmp_path / "out")]
-    assert main([*again, *OPTIONS]) == ExitCode.DONE
-    capsys.readouterr()
-    assert main([*again, *OPTIONS, "--min-hands", "0.25", "--focal", "90"]) == ExitCode.USAGE
-    said = capsys.readouterr().err
-    assert "Choose another folder (--out), or the same inputs: --" in said
-    assert "--min-hands: the folder has '0.5', this run has '0.25'" in said
-    assert "--focal: the folder has 'None', this run has '90.0'" in said
-
-
-def test_every_field_of_a_configuration_has_an_option():
-    """But the threshold of shot changes, which no option sets."""
-    command = Annotate(videos=(Path("cup.mp4"),), out=Path("out"))
-    with show_options(command):
-        fields = run._flat(plain(command._config()))
-        assert [name for name in fields if option_of(name) is None] == ["cutting.cut_difference"]

@@ -5,10 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from egosim_jax.cli.episode import MakeEpisode, summary
+from egosim_jax.cli.episode import MakeEpisode
 from egosim_jax.simulation.actions import read_action
-from egosim_jax.simulation.episode import Episode
-from egosim_jax.types import InputError, SceneState
+from egosim_jax.types import InputError
 
 READ = {"height": 48, "width": 80, "prompt": None}
 
@@ -53,24 +52,8 @@ def test_an_action_file_that_is_wrong_is_refused(own, fields, message):
         read_action(own(**fields), **READ)
 
 
-@pytest.mark.parametrize("option", [{"clips": 2}, {"seed": 0}, {"robot": True}])
+@pytest.mark.parametrize("option", [{"seed": 0}, {"robot": True}])
 def test_options_of_the_tabletop_world_are_refused_with_own_actions(own, tmp_path, option):
     name = next(iter(option))
     with pytest.raises(InputError, match=f"--{name} is for the tabletop world"):
         MakeEpisode(out=tmp_path / "out", actions=(own(),), **option).run()
-
-
-def test_the_summary_names_clips_without_hands(own):
-    hand = np.linspace((0.0, 0.0, 0.5), (0.1, 0.1, 0.5), 21).tolist()
-    shown = read_action(own(joints_m=[[hand], [None]]), **READ)
-    hidden = read_action(own(), **READ)
-    state = SceneState(
-        points_m=np.full((2, 3), (0, 0, 1), np.float32),
-        colors=np.zeros((2, 3), np.uint8),
-        object_ids=np.zeros(2, np.int32),
-        last_seen=np.zeros(2, np.int32),
-        intrinsics_px=shown.cameras.intrinsics_px,
-    )
-    assert "human hands, 2 points" in summary(Episode(state=state, actions=(shown,), fps=8))
-    both = summary(Episode(state=state, actions=(shown, hidden), fps=8))
-    assert "2 clips of 2 frames of 80x48 at 8 fps, human hands (none in clip 2), 2 points" in both

@@ -13,7 +13,8 @@ from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.evaluation.files import cell
 from egosim_jax.evaluation.metrics import lpips
 from egosim_jax.evaluation.metrics.image import psnr, ssim
-from egosim_jax.io.video import read_video, write_video
+from egosim_jax.io.video import read_video
+from egosim_jax.io.writing import write_video
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.types import InputError
 
@@ -71,17 +72,6 @@ def test_lpips_is_a_column_with_its_protocol(clips, run, network, capsys):
     assert lpips.DEFINITION in printed
 
 
-def test_without_the_extra_the_column_is_absent_and_the_report_says_so(
-    clips, run, monkeypatch, capsys
-):
-    monkeypatch.setattr(lpips, "load_if_installed", lambda name: None)
-    assert Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run() == ExitCode.DONE
-    found = set(metrics(run)["clip1"]["generated"])
-    assert found == {"psnr", "ssim", "psnr_clip", "color_drift"}
-    assert "lpips_alex" not in json.loads((run / "report.json").read_text())["splits"]["test"]
-    assert "Install egosim-jax[metrics]" in capsys.readouterr().out
-
-
 def test_without_the_extra_there_is_no_page_and_the_report_says_so(clips, run, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "jinja2", None)
     assert Evaluate(generated=(str(run),), metadata=clips).run() == ExitCode.DONE
@@ -111,13 +101,6 @@ def test_a_reconstruction_is_compared_as_the_upper_bound(clips, run):
     assert "vae" not in metrics(run)["clip1"]
 
 
-def test_the_ground_truth_is_resized_to_the_generated_size(clips, run):
-    small = target_of(clips, "clip0")[:, ::2, ::2]
-    write_video(run / "clip0.mp4", small, 16)
-    Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run()
-    assert metrics(run)["clip0"]["generated"]["psnr"] > 25
-
-
 def test_results_name_the_windows(clips, run):
     write_video(run / "clip0_3.mp4", target_of(clips, "clip0")[3:8], 16)
     line = {"video_id": "clip0_3", "source_id": "clip0", "start": 3, "status": "done"}
@@ -127,13 +110,6 @@ def test_results_name_the_windows(clips, run):
     generated, reference = read_video(run / "clip0_3.mp4").frames, target_of(clips, "clip0")[3:8]
     expected = psnr(generated, reference)[1:].mean()
     assert metrics(run)["clip0_3"]["generated"]["psnr"] == pytest.approx(expected)
-
-
-def test_the_last_line_of_a_clip_counts(clips, run):
-    lines = [{"video_id": "clip0", "source_id": "clip0", "start": 0, "status": "failed"}]
-    lines.append({**lines[0], "status": "done"})
-    (run / "results.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    assert Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run() == ExitCode.DONE
 
 
 def test_a_clip_that_failed_is_skipped_and_named(clips, run, capsys):
@@ -153,24 +129,6 @@ def test_a_missing_clip_is_skipped_and_named(clips, run, capsys):
     assert f"skipped: clip0: {run / 'clip0.mp4'} cannot be read: No such" in capsys.readouterr().err
 
 
-def test_rows_are_selected_by_column(clips, run):
-    assert (
-        Evaluate(generated=(str(run),), page_clips=0, metadata=clips, where="split=test").run()
-        == ExitCode.DONE
-    )
-    assert list(metrics(run)) == ["clip1"]
-
-
-def test_the_report_has_definitions_and_a_summary_for_each_split(clips, run, tmp_path, capsys):
-    Evaluate(generated=(str(run),), page_clips=0, metadata=clips, out=tmp_path / "report").run()
-    report = json.loads((tmp_path / "report" / "report.json").read_text())
-    assert {"psnr", "ssim", "lpips_alex", "spread", "frames"} <= set(report["definitions"])
-    assert report["splits"]["train"]["generated"]["clips"] == 1
-    printed = capsys.readouterr().out
-    assert "split train, 1 clip:" in printed
-    assert "split test, 1 clip:" in printed
-
-
 def test_a_ground_truth_that_ends_before_the_clip_is_named(clips, run, capsys):
     for name in ("clip0", "clip1"):
         write_video(run / f"{name}.mp4", np.zeros((13, 32, 48, 3), np.uint8), 16)
@@ -179,37 +137,11 @@ def test_a_ground_truth_that_ends_before_the_clip_is_named(clips, run, capsys):
     assert "ends before frame 13" in capsys.readouterr().err
 
 
-def test_metadata_without_ground_truth_is_refused(clips, run):
-    lines = clips.read_text().splitlines()
-    clips.write_text("\n".join(line.split(",", 1)[1] for line in lines))
-    with pytest.raises(InputError, match="could be compared"):
-        Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run()
-
-
-def test_a_missing_folder_is_refused(clips, tmp_path):
-    with pytest.raises(InputError, match="There is no folder"):
-        Evaluate(generated=(str(tmp_path / "none"),), metadata=clips).run()
-
-
 def test_a_clip_of_fewer_frames_is_skipped_and_named(clips, run, capsys):
     write_video(run / "clip0.mp4", target_of(clips, "clip0")[:5], 16)
     assert Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run() == ExitCode.PARTIAL
     assert "skipped: clip0: it has 5 frames, most clips 9." in capsys.readouterr().err
     assert list(metrics(run)) == ["clip1"]
-
-
-def test_the_report_names_the_protocol(clips, run, capsys):
-    for name in ("clip0", "clip1"):
-        write_video(run / f"{name}.mp4", target_of(clips, name)[:, ::2, :32], 16)
-    Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run()
-    protocol = json.loads((run / "report.json").read_text())["protocol"]
-    assert (protocol["size"], protocol["pixels"], protocol["frames"]) == (
-        "output",
-        ["32x16"],
-        [1, 8],
-    )
-    assert "LANCZOS" in protocol["resize"]
-    assert "frames 1 to 8 at the size of the output: 32x16" in capsys.readouterr().out
 
 
 def test_methods_of_different_size_compare_at_the_size_of_the_target_of(clips, run, tmp_path):
@@ -225,25 +157,12 @@ def test_methods_of_different_size_compare_at_the_size_of_the_target_of(clips, r
     assert metrics(small)["clip0"]["prior"] != metrics(run)["clip0"]["prior"]
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "[]",
-        "{",
-        *(
-            json.dumps({"video_id": "a", "source_id": "a", "start": 0, "status": "done", **change})
-            for change in (
-                {"video_id": "../../x"},
-                {"video_id": 3},
-                {"source_id": ["a"]},
-                {"start": "x"},
-                {"start": None},
-                {"status": None},
-            )
-        ),
-    ],
-)
-def test_invalid_results_are_refused(clips, run, line):
+DONE = {"video_id": "a", "source_id": "a", "start": 0, "status": "done"}
+
+
+@pytest.mark.parametrize("changed", [None, {"video_id": "../x"}, {"start": None}])
+def test_invalid_results_are_refused(clips, run, changed):
+    line = "{" if changed is None else json.dumps({**DONE, **changed})
     (run / "results.jsonl").write_text(line + "\n")
     with pytest.raises(InputError, match=r"results\.jsonl, line 1"):
         Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run()
@@ -252,13 +171,9 @@ def test_invalid_results_are_refused(clips, run, line):
 HOSTILE = {
     "mathtext": r"$\foo$",
     "formula": "=cmd|' /C calc'!A0",
-    "sum": "@SUM(A1)",
-    "full width": "\uff1d1+1",
-    "tab": "\t=1+1",
     "escape": "\x1b[31mred",
     "markup": "[/red]<script>",
     "LaTeX": r"\input{/etc/passwd}%",
-    "long": "x" * 3000,
 }
 
 

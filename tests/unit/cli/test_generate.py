@@ -1,7 +1,6 @@
 """`egosim generate`: invalid input is refused before compilation."""
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -10,8 +9,6 @@ from safetensors.numpy import save_file
 from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
 from egosim_jax.data.clips import write_clips
-from egosim_jax.data.metadata import read_metadata
-from egosim_jax.data.windows import conditions_sha256, windows_of
 from egosim_jax.generation.batch import BatchJob
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.types import InputError, VideoSpec
@@ -27,10 +24,19 @@ def test_a_lora_of_other_weights_is_refused(debug_weights, tmp_path, capsys):
     assert "was trained on other weights" in capsys.readouterr().err
 
 
-def test_the_strength_of_no_lora_is_refused(tmp_path, capsys):
-    options = ["--config", "debug", "--out", str(tmp_path / "out"), "--lora-scale", "0.5"]
-    assert main(["generate", *options]) == ExitCode.USAGE
-    assert "--lora-scale is the strength of a LoRA" in " ".join(capsys.readouterr().err.split())
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (["--lora-scale", "0.5"], "(--lora)"),
+        (["--metadata", "a.csv", "--robot"], "(--robot, --metadata)"),
+        (["--solver", "eulr"], "(--solver)"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(tmp_path, capsys, options, named):
+    command = ["generate", "--config", "debug", "--out", str(tmp_path / "out"), *options]
+    assert main(command) == ExitCode.USAGE
+    assert named in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_job_is_of_all_files_of_its_lora(debug_weights, tmp_path):
@@ -54,12 +60,6 @@ def clip():
     return to_triplet(next(make_sequence(0, spec=VideoSpec(frames=9, height=64, width=96))))
 
 
-def test_a_robot_cannot_be_given_to_recorded_clips(tmp_path, capsys):
-    options = ["--metadata", "a.csv", "--robot", "--out", str(tmp_path / "out")]
-    assert main(["generate", "--config", "debug", *options]) == ExitCode.USAGE
-    assert "have their own hands" in " ".join(capsys.readouterr().err.split())
-
-
 @pytest.mark.parametrize("other", ["x_cmp", "x_vae"])
 def test_two_clips_that_would_write_one_file_are_refused(clip, other, tmp_path, capsys):
     clips = [replace(clip, video_id=name) for name in ("x", other)]
@@ -68,28 +68,6 @@ def test_two_clips_that_would_write_one_file_are_refused(clip, other, tmp_path, 
     assert main(["generate", *args]) == ExitCode.USAGE
     assert f"The clips x and {other} would both write {other}.mp4" in capsys.readouterr().err
     assert not list((tmp_path / "out").glob("*.mp4"))
-
-
-@pytest.mark.parametrize(
-    ("prompt", "starts", "message"),
-    [("Pour the tea.", (0,), "another prompt"), ("", (4,), "another start: 0, not 4")],
-)
-def test_a_clip_of_another_prompt_or_window_is_not_taken_for_this_one(
-    clip, prompt, starts, message, tmp_path
-):
-    clip = replace(clip, prompt="Lift the cup.")
-    out, job = tmp_path / "out", partial(BatchJob, model=configs.get("debug"), weights=None)
-    changed = replace(clip, prompt=prompt or clip.prompt)
-    before, after = (
-        windows_of(read_metadata(write_clips(tmp_path / name, [one], fps=8)), chosen)
-        for name, one, chosen in (("before", clip, (0,)), ("after", changed, starts))
-    )
-    digest = conditions_sha256(before[0].files)
-    job(out=out)._report(before[0], status="done", conditions_sha256=digest)
-    (out / f"{clip.video_id}.mp4").touch()
-    job(out=out, skip_existing=True).generate(before)
-    with pytest.raises(InputError, match=message):
-        job(out=out, skip_existing=True).generate(after)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -14,7 +13,8 @@ from egosim_jax.data.metadata import read_metadata
 from egosim_jax.data.mixing import open_shards
 from egosim_jax.data.pack import pack
 from egosim_jax.geometry import rotation_z
-from egosim_jax.io.video import probe_video, read_video, write_video
+from egosim_jax.io.video import probe_video, read_video
+from egosim_jax.io.writing import write_video
 from egosim_jax.state.snapshot import save, write_ply
 from egosim_jax.types import InputError, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
@@ -119,18 +119,6 @@ def test_a_mesh_is_drawn_in_the_colors_of_its_vertices(clip, action, tmp_path):
     assert triplet.mask.max() == 0 or (triplet.mask > 127).mean() < 0.9
 
 
-def test_wrong_meshes_are_refused(clip, action, tmp_path):
-    table = np.array([[-3, -1, 0], [3, -1, 0], [3, 3, 0], [-3, 3, 0]])
-    colors = np.full((4, 3), 100)
-    square = write_mesh(tmp_path / "a.ply", table, colors, [[0, 1, 2, 3]])
-    far = write_mesh(tmp_path / "b.ply", table, colors, [[0, 1, 9]])
-    behind = write_mesh(tmp_path / "c.ply", table - [0, 50, 0], colors, [[0, 1, 2]])
-    for mesh, message in ((square, "Triangulate"), (far, "not triangles"), (behind, "first frame")):
-        with pytest.raises(InputError, match=message):
-            Static(action=action, out=tmp_path / "out", scene=mesh, **FILES).run()
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_moving_camera_needs_a_scene(clip, action, fixed, tmp_path):
     write_video(tmp_path / "clip.mp4", clip.frames, 8)
     values = json.loads(fixed.read_text("utf-8"))
@@ -169,35 +157,11 @@ def test_a_fixed_camera_repeats_the_first_frame(clip, fixed, tmp_path):
         Static(video=tmp_path / "short.mp4", **files).run()
 
 
-def test_keypoints_in_another_order_are_refused(clip, fixed, tmp_path):
-    values = json.loads(fixed.read_text("utf-8"))
-    for hands in values["joints_m"]:
-        for number, joints in enumerate(hands):
-            hands[number] = [*joints[1:], joints[0]]
-    fixed.write_text(json.dumps(values), "utf-8")
-    write_video(tmp_path / "clip.mp4", clip.frames, 8)
-    files = {"action": fixed, "out": tmp_path / "out", **FILES}
-    with pytest.raises(InputError, match=r"order with the wrist last: .*\(--action\)"):
-        Static(video=tmp_path / "clip.mp4", **files).run()
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_triplet_keeps_the_frame_rate_of_its_video(clip, fixed, tmp_path):
-    rate = Fraction(30000, 1001)
-    write_video(tmp_path / "clip.mp4", clip.frames, rate)
-    command = Static(action=fixed, out=tmp_path / "out", video=tmp_path / "clip.mp4", **FILES)
-    assert command.run() == 0
-    (files,) = read_metadata(tmp_path / "out" / "metadata.csv")
-    assert probe_video(files.target).fps == probe_video(files.prior).fps == rate
-    with pytest.raises(InputError, match=r"29\.97 frames per second, not 8: .*Omit --fps"):
-        replace(command, fps=8).run()
-
-
 def test_folders_of_dwm_keep_the_frame_rate_of_their_shards(clip, tmp_path):
     twin = to_triplet(clip, prior="static", hands="mesh")
     twins = [replace(twin, video_id=name) for name in ("a", "b")]
     items = read_metadata(write_folders(tmp_path / "root", twins, name="s", fps=24))
-    packed = {"videos": (None, "first"), "frames": (SPEC, "first"), "rate": (SPEC, "rate")}
+    packed = {"videos": (None, "first"), "frames": (SPEC, "stride"), "rate": (SPEC, "rate")}
     again = items[0].target, items[0].prior, items[0].hands
     for name, (spec, rule) in packed.items():
         if name == "rate":  # whose shorter clips have every third frame
@@ -220,18 +184,6 @@ def test_folders_of_dwm_keep_the_frame_rate_of_their_shards(clip, tmp_path):
     for name, have in (("videos", 24), ("rate", 8)):
         with pytest.raises(InputError, match=f"have {have} frames per second, not 30"):
             rate(name, fps=30)
-
-
-def test_videos_of_several_rates_are_not_one_set_of_dwm(clip, tmp_path):
-    twin = to_triplet(clip, prior="static", hands="mesh")
-    items = []
-    for name, fps in (("a", 8), ("b", 12)):
-        path = write_folders(tmp_path / name, [replace(twin, video_id=name)], name=name, fps=fps)
-        items += read_metadata(path)
-    list(pack(items, out=tmp_path / "shards", spec=None, provenance={}))
-    with pytest.raises(InputError, match="have 8, 12 frames per second: all must have one"):
-        ToDwm(shards=tmp_path / "shards", out=tmp_path / "out", name="b").run()
-    assert not (tmp_path / "out").exists()
 
 
 def test_hands_of_mano_replace_those_of_keypoints(clip, fixed, tmp_path):

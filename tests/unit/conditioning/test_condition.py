@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -53,6 +54,13 @@ def test_dropped_hands_and_text_are_zero_and_nothing_else_changes(name):
     dropped = ConditionDropout(**{name: 1.0}).apply(CONDITION, jax.random.key(0))
     assert (getattr(dropped, name) == 0).all()
     assert differing(dropped, CONDITION) == {name}
+
+
+def test_a_dropped_prompt_is_the_negative_one_of_a_model_that_has_one():
+    condition = replace(CONDITION, null_text=jnp.full((3, 2, 4), 9.0))
+    dropped = condition.drop("text", jnp.array([True, False, True]))
+    assert dropped.text[:, 0, 0].tolist() == [9, 5, 9]
+    assert differing(dropped, condition) == {"text"}
 
 
 def test_without_rates_nothing_changes():

@@ -5,11 +5,11 @@ import struct
 import pytest
 from tokenizers import Tokenizer
 
-from egosim_jax.conditioning.sentencepiece import read_spiece
+from egosim_jax.conditioning.sentencepiece import fields, read_spiece
 from egosim_jax.conditioning.text import PromptTokenizer
 from egosim_jax.types import InputError
 
-NORMAL, UNKNOWN, CONTROL = 1, 2, 3
+NORMAL, UNKNOWN, CONTROL, BYTE = 1, 2, 3, 6
 PIECES = [
     ("<pad>", 0.0, CONTROL), ("</s>", 0.0, CONTROL), ("<unk>", 0.0, UNKNOWN),
     ("▁a", -2.0, NORMAL), ("▁hand", -3.0, NORMAL), ("▁lifts", -3.5, NORMAL), ("▁", -4.0, NORMAL),
@@ -81,6 +81,23 @@ def test_it_tokenizes_as_the_converter_of_transformers(folder):
     for text in ("a hand lifts", "  a   lifts s ", "zz lift", "handa"):
         want = theirs.encode(text, add_special_tokens=False).ids
         assert ours.encode(text, add_special_tokens=False).ids == want
+
+
+def test_characters_without_a_piece_are_bytes_where_the_model_has_them(tmp_path):
+    pieces = [*PIECES, ("<0xC3>", -9.0, BYTE), ("<0xA9>", -9.0, BYTE)]
+    (tmp_path / "spiece.model").write_bytes(model(pieces))
+    tokenizer = read_spiece(tmp_path / "spiece.model")
+    assert tokenizer.encode("a é").ids == [3, 6, len(PIECES), len(PIECES) + 1]
+
+
+def test_fields_of_all_wire_types_are_read():
+    eight, four = bytes(range(8)), bytes(range(4))
+    data = b"\x08\xac\x02" + b"\x11" + eight + b"\x1a\x02AB" + b"\x25" + four
+    assert list(fields(data)) == [(1, 300), (2, eight), (3, b"AB"), (4, four)]
+    assert list(fields(b"\x08" + 9 * b"\xff" + b"\x01")) == [(1, 2**64 - 1)]
+    for damaged in (data[:-1], b"\x11" + eight[:7], b"\x08" + 10 * b"\xff" + b"\x01"):
+        with pytest.raises(ValueError, match=r"ends in the field|more than 64 bits"):
+            list(fields(damaged))
 
 
 @pytest.mark.parametrize("cut", [1, 5, 30, 100])

@@ -59,6 +59,7 @@ def test_prompts_that_are_too_long_are_cut_before_the_end_token_and_counted():
     assert tokens.ids.tolist() == [[100, 101, 102, 1]] * 3
     assert tokens.lengths == (4, 5, 9)
     assert tokens.cut == 2
+    assert PromptTokenizer(max_tokens=1).tokenize(["abc"]).ids.tolist() == [[1]]
 
 
 def test_prompts_are_cleaned_before_they_are_tokenized():

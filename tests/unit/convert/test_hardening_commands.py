@@ -9,11 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from diffusers import AutoencoderKLWan, DiffusionPipeline, WanTransformer3DModel
 from flax import nnx
 from safetensors.numpy import load_file
-from safetensors.torch import save_file
 from transformers import CLIPVisionModel, UMT5EncoderModel
 
 from egosim_jax import configs
@@ -131,10 +129,7 @@ def commands(tmp_path):
     }
 
 
-COMMANDS = ("weights", "lora", "merge", "to-torch")
-
-
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", ["weights", "merge"])
 def test_a_full_disk_is_one_line(tmp_path, capsys, monkeypatch, name):
     args = commands(tmp_path)[name]
 
@@ -142,22 +137,14 @@ def test_a_full_disk_is_one_line(tmp_path, capsys, monkeypatch, name):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patch:
-        patch.setattr(writer.os, "pwrite", full)
+        patch.setattr(writer.os, "fsync", full)
         out = tmp_path / "out" / "x.safetensors"
         assert "No space left" in one_line(capsys, 1, *args, "--out", out)
     assert not [path for path in tmp_path.glob("out/**/*.safetensors") if path.is_file()]
     assert main([str(arg) for arg in [*args, "--out", out]]) == 0
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_folder_that_cannot_be_written_to_is_one_line(tmp_path, capsys, name):
-    (tmp_path / "file").write_text("", encoding="utf-8")
-    args = commands(tmp_path)[name]
-    assert "file" in one_line(capsys, 2, *args, "--out", tmp_path / "file" / "out" / "x")
-    assert "/proc" in one_line(capsys, 1, *args, "--out", "/proc/none/x")
-
-
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", ["lora", "to-torch"])
 def test_a_second_process_is_one_line(tmp_path, capsys, name):
     args, out = commands(tmp_path)[name], tmp_path / "out"
     held = out if name != "lora" else tmp_path
@@ -190,13 +177,6 @@ def test_a_missing_file_is_one_line(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_names_are_not_markup(tmp_path, capsys):
-    name = "[/b].visual.cls_embedding"
-    save_file({name: torch.rand(1)}, tmp_path / "x.safetensors")
-    assert main(["inspect", str(tmp_path), "--tensors"]) == 0
-    assert "[/b]." in capsys.readouterr().out
-
-
 def test_a_damaged_file_of_ours_is_refused_when_it_is_used(tmp_path, capsys):
     base = ours(tmp_path / "base", "text")
     file = base / "text.safetensors"
@@ -206,9 +186,8 @@ def test_a_damaged_file_of_ours_is_refused_when_it_is_used(tmp_path, capsys):
     args = ["to-torch", base, "--config", "debug", "--only", "text", "--out", tmp_path / "out"]
     assert "is damaged" in one_line(capsys, 2, *args)
     assert not list((tmp_path / "out").glob("[!.]*"))
-    from egosim_jax.models.wan.umt5 import UMT5
 
-    network = nnx.eval_shape(lambda: UMT5(CONFIG.text, rngs=nnx.Rngs(0)))
+    network = nnx.eval_shape(lambda: CONFIG.text.build(rngs=nnx.Rngs(0)))
     with pytest.raises(InputError, match="is damaged"):
         weights.load(file, network)
 
@@ -217,6 +196,6 @@ def test_what_is_converted_has_checksums_and_no_more_metadata_for_others(tmp_pat
     source = theirs(tmp_path)
     assert main([str(arg) for arg in convert(source, tmp_path / "out")]) == 0
     about = read_metadata(tmp_path / "out" / "text.safetensors")
-    assert {"sha256", "checksums", "seal"} <= about.keys()
+    assert {"sha256", "checksums", "plan"} <= about.keys()
     (file,) = source.glob("*.safetensors")
     assert read_metadata(file) == {"format": "pt"}

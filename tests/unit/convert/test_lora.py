@@ -1,252 +1,290 @@
-"""LoRA files of every naming give the same changes, and other projects load written files."""
+"""LoRA files of every project give the same change, by one table of names and strengths."""
 
 import json
+import math
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import torch
-from diffusers.loaders import lora_conversion_utils as diffusers_rules
-from flax import nnx
-from safetensors.torch import load_file, save_file
 
-from egosim_jax import configs
 from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.lora import read_lora
-from egosim_jax.io import weights
-from egosim_jax.io.mapped import read_metadata
-from egosim_jax.models import lora
-from egosim_jax.models.wan.dit import WanDiT
+from egosim_jax.io.mapped import read_safetensors
+from egosim_jax.models.lora import Value
 from egosim_jax.types import InputError
+from tests.unit.convert.made import CONFIG, DIM, LAYER, NAME, arrays, one_line, ours, pair, save
 
-CONFIG = configs.get("debug").dit
-RANK, ALPHA = 3, 6.0
+RANK = 4
+PEFT = {
+    "r": RANK,
+    "lora_alpha": 6,
+    "peft_type": "LORA",
+    "target_modules": ["q", "0", "to_q", "proj"],
+}
+WAN = {"blocks.1.self_attn.q": "blocks.self_attn.q", "blocks.1.ffn.0": "blocks.mlp.up"}
+DIFFUSERS = {
+    "blocks.1.attn1.to_q": "blocks.self_attn.q",
+    "blocks.1.ffn.net.0.proj": "blocks.mlp.up",
+}
 
+NAMES = {
+    "PEFT": (WAN, "base_model.model.{}", "lora_A.default.weight", "lora_B.default.weight"),
+    "diffusers, finetrainers, SimpleTuner": (
+        DIFFUSERS, "transformer.{}", "lora_A.weight", "lora_B.weight",
+    ),
+    "diffusers of before": (DIFFUSERS, "transformer.{}", "lora.down.weight", "lora.up.weight"),
+    "ComfyUI": (WAN, "diffusion_model.{}", "lora_A.weight", "lora_B.weight"),
+    "LightX2V": (WAN, "diffusion_model.{}", "lora_down.weight", "lora_up.weight"),
+    "FastVideo": (DIFFUSERS, "{}", "lora_A", "lora_B"),
+    "kohya, musubi": (WAN, "lora_unet_{_}", "lora_down.weight", "lora_up.weight"),
+    "VideoX-Fun": (WAN, "lora_unet__{_}", "lora_down.weight", "lora_up.weight"),
+    "LyCORIS": (WAN, "lycoris_{_}", "lora_down.weight", "lora_up.weight"),
+}  # fmt: skip
+"""Layers, their names, and the ends of the two factors by project."""
 
-def layers():
-    """Wan's name of every linear layer of the blocks, and its shape [out, in]."""
-    dim, ffn = CONFIG.dim, CONFIG.ffn_dim
-    for block in range(CONFIG.layers):
-        for attention in ("self_attn", "cross_attn"):
-            for name in "qkvo":
-                yield f"blocks.{block}.{attention}.{name}", (dim, dim)
-        for name in ("k_img", "v_img"):
-            yield f"blocks.{block}.cross_attn.{name}", (dim, dim)
-        yield f"blocks.{block}.ffn.0", (ffn, dim)
-        yield f"blocks.{block}.ffn.2", (dim, ffn)
-
-
-def in_diffusers(name: str) -> str:
-    for theirs, ours in {
-        "self_attn": "attn1", "cross_attn": "attn2", ".ffn.0": ".ffn.net.0.proj",
-        ".ffn.2": ".ffn.net.2",
-    }.items():  # fmt: skip
-        name = name.replace(theirs, ours)
-    *front, last = name.split(".")
-    if "attn" in name:
-        words = {"o": "to_out.0", "k_img": "add_k_proj", "v_img": "add_v_proj"}
-        last = words.get(last, f"to_{last}")
-    return ".".join([*front, last])
+STRENGTHS = [
+    ({}, 1, "alpha is taken as the rank"),
+    ({"tensor": ("alpha", 6.0)}, 6 / 4, ""),
+    ({"tensor": ("lora_alpha", 6.0)}, 6 / 4, ""),
+    ({"tensor": ("alpha", 0.0)}, 1, "alpha 0 is taken as the rank"),
+    ({"tensor": ("alpha", 6.0), "rank": "16", "alpha": "16"}, 6 / 4, ""),
+    ({"lora_alpha": "6", "lora_rank": "4"}, 6 / 4, ""),
+    ({"lora_alpha": "6", "use_rslora": "True"}, 6 / 2, ""),
+    ({"network_alpha": "6"}, 6 / 4, ""),
+    ({"network_alpha": "0"}, 1, "alpha 0 is taken as the rank"),
+    ({"ss_network_alpha": "6.0", "ss_network_dim": "16"}, 6 / 4, ""),
+    ({"ss_network_alpha": "0.0"}, 1, "alpha 0 is taken as the rank"),
+    ({"ss_network_alpha": "None"}, 1, "alpha is taken as the rank"),
+    ({"alpha": "6"}, 6 / 4, ""),
+    (
+        {"tensor": ("alpha", 6.0), "ss_network_args": '{"rs_lora": "True", "conv_alpha": "1"}'},
+        6 / 2,
+        "",
+    ),
+    ({"ss_network_alpha": "6", "ss_tag_frequency": '{"alpha male": 3, "rank 1": 2}'}, 6 / 4, ""),
+    ({"training": '{"lora_alpha": 6, "lr": 1e-4}', "note": "{rank"}, 6 / 4, ""),
+    ({"lora_config": json.dumps(PEFT | {"target_modules": "(to_q|ffn)"})}, 6 / 4, ""),
+    ({"lora_adapter_metadata": json.dumps(PEFT | {"use_rslora": True})}, 6 / 2, ""),
+    ({"adapter_config": json.dumps(PEFT | {"r": 8, "rank_pattern": {"q": RANK}})}, 6 / 4, ""),
+    ({"peft_config": json.dumps(PEFT), "lora_alpha": "6"}, 6 / 4, ""),
+    ({"peft_config": '{"network_alpha": 6}'}, 6 / 4, ""),
+    (
+        {
+            "lora_adapter_metadata": json.dumps(
+                {f"transformer.{key}": value for key, value in {"r": 4, "lora_alpha": 6}.items()}
+                | {"text_encoder.lora_alpha": 1}
+            )
+        },
+        6 / 4,
+        "",
+    ),
+]
+"""Header, or the end and value of a tensor; the factor of B A; and the note that is printed."""
 
 
 @pytest.fixture(scope="module")
-def pairs():
+def factors():
     torch.manual_seed(0)
-    return {
-        name: (torch.randn(RANK, wide), torch.randn(out, RANK)) for name, (out, wide) in layers()
-    }
+    wide = {"blocks.self_attn.q": DIM, "blocks.mlp.up": CONFIG.dit.ffn_dim}
+    return {p: (torch.randn(RANK, DIM) / 4, torch.randn(out, RANK) / 4) for p, out in wide.items()}
 
 
-def written(form, pairs, folder):
-    """The same LoRA in the files of other projects."""
-    tensors, path = {}, folder / "lora.safetensors"
-    scale = ALPHA / RANK
-    for name, (down, up) in pairs.items():
-        kohya = name.replace(".", "_")
-        match form:
-            case "ComfyUI":
-                base, ends = f"diffusion_model.{name}", ("lora_A.weight", "lora_B.weight")
-                tensors[f"{base}.alpha"] = torch.tensor(ALPHA)
-            case "ComfyUI, down and up":
-                base, ends = f"diffusion_model.{name}", ("lora_down.weight", "lora_up.weight")
-                tensors[f"{base}.alpha"] = torch.tensor(ALPHA)
-            case "VideoX-Fun":
-                base, ends = f"lora_unet__{kohya}", ("lora_down.weight", "lora_up.weight")
-                tensors[f"{base}.alpha"] = torch.tensor(ALPHA)
-            case "musubi":
-                base, ends = f"lora_unet_{kohya}", ("lora_down.weight", "lora_up.weight")
-                tensors[f"{base}.alpha"] = torch.tensor(ALPHA)
-            case "PEFT":
-                base = f"base_model.model.{name}"
-                ends = ("lora_A.default.weight", "lora_B.default.weight")
-            case "diffusers":
-                base = f"transformer.{in_diffusers(name)}"
-                ends = ("lora_A.weight", "lora_B.weight")
-                up = scale * up  # as diffusers saves it: without an alpha
-        tensors |= {f"{base}.{ends[0]}": down, f"{base}.{ends[1]}": up}
-    if form == "PEFT":
-        config = {"r": RANK, "lora_alpha": ALPHA}
-        (folder / "adapter_config.json").write_text(json.dumps(config), encoding="utf-8")
-        path = folder / "adapter_model.safetensors"
-    save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, path)
-    return folder if form == "PEFT" else path
+@pytest.mark.parametrize("names", NAMES)
+def test_the_change_is_the_scaled_product_of_the_factors(names, factors, tmp_path, capsys):
+    layers, form, *ends = NAMES[names]
+    for said, scale, note in STRENGTHS:
+        header, tensors = dict(said), {}
+        end, alpha = header.pop("tensor", (None, None))
+        for layer, path in layers.items():
+            name = form.replace("{_}", layer.replace(".", "_")).replace("{}", layer)
+            tensors |= {f"{name}.{e}": t for e, t in zip(ends, factors[path], strict=True)}
+            tensors |= {} if end is None else {f"{name}.{end}": torch.tensor(alpha)}
+        changes = read_lora(save(tmp_path / "x.safetensors", tensors, header), CONFIG.dit)
+        assert changes.keys() == factors.keys()
+        for path, (down, up) in factors.items():
+            expected = (scale * up.double() @ down.double()).numpy().T
+            product = changes[path].down[1] @ changes[path].up[1]
+            np.testing.assert_allclose(product, expected, rtol=1e-6, atol=1e-6, err_msg=str(said))
+            assert not changes[path].up[0].any()
+        printed = capsys.readouterr().err
+        assert note in printed if note else not printed, said
 
 
-FORMS = ("ComfyUI", "ComfyUI, down and up", "VideoX-Fun", "musubi", "PEFT", "diffusers")
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_every_naming_is_the_same_sum(form, pairs, tmp_path):
-    deltas = read_lora(written(form, pairs, tmp_path), CONFIG)
-    assert len(deltas) == 12
-    for name, path in (
-        ("blocks.1.self_attn.q", "blocks.self_attn.q"),
-        ("blocks.1.cross_attn.v_img", "blocks.cross_attn.image.v"),
-        ("blocks.1.ffn.2", "blocks.mlp.down"),
-    ):
-        down, up = pairs[name]
-        product = deltas[path].down[1] @ deltas[path].up[1]
-        expected = (ALPHA / RANK * up @ down).numpy().T
-        np.testing.assert_allclose(product, expected, rtol=1e-5, atol=1e-5)
-
-
-def network():
-    """`debug` with weights that all have an effect."""
-    made = WanDiT(CONFIG, rngs=nnx.Rngs(0))
-    rng = np.random.default_rng(1)
-    made.head.linear.kernel.set_value(
-        jnp.asarray(rng.normal(size=made.head.linear.kernel.shape), jnp.float32)
-    )
-    return made
-
-
-def velocity(made):
-    rng = np.random.default_rng(2)
-    shapes = ((1, 3, 4, 6, CONFIG.in_channels), (1, 5, CONFIG.text_dim), (1, 5, CONFIG.image_dim))
-    latents, text, image = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in shapes)
-    return np.asarray(made(latents, jnp.array([400.0]), text, image))
-
-
-def test_applied_and_merged_are_the_same_and_scaled_as_asked(pairs, tmp_path):
-    small = {name: (0.1 * down, 0.1 * up) for name, (down, up) in pairs.items()}
-    file = written("ComfyUI", small, tmp_path)
-    deltas = read_lora(file, CONFIG)
-    without = velocity(network())
-    applied = network()
-    lora.apply(applied, deltas, scale=0.5)
-    first = velocity(applied)
-    size = np.abs(first).max()
-    assert np.abs(first - without).max() > 0.1 * size
-    weights.save(tmp_path / "base" / "dit.safetensors", network())
-    args = ["lora", str(file), "--config", "debug", "--scale", "0.5", "--merge"]
-    assert main([*args, str(tmp_path / "base"), "--out", str(tmp_path / "out")]) == 0
-    merged = nnx.eval_shape(lambda: WanDiT(CONFIG, rngs=nnx.Rngs(0)))
-    weights.load(tmp_path / "out" / "dit.safetensors", merged)
-    np.testing.assert_allclose(velocity(merged), first, atol=1e-5 * size)
-
-
-def test_what_is_written_is_read_by_diffusers_own_rules(pairs, tmp_path):
-    (tmp_path / "peft").mkdir()
-    file = written("PEFT", pairs, tmp_path / "peft")
-    out = tmp_path / "out" / "lora.safetensors"
-    assert main(["lora", str(file), "--config", "debug", "--out", str(out)]) == 0
-    about = read_metadata(out)
-    assert (about["rank"], about["alpha"]) == (str(RANK), str(RANK))
-    theirs = diffusers_rules._convert_non_diffusers_wan_lora_to_diffusers(load_file(out))
-    assert len(theirs) == 2 * len(pairs)
-    for name, (down, up) in pairs.items():
-        base = f"transformer.{in_diffusers(name)}"
-        found = theirs[f"{base}.lora_B.weight"] @ theirs[f"{base}.lora_A.weight"]
-        torch.testing.assert_close(found, ALPHA / RANK * up @ down, rtol=1e-5, atol=1e-5)
-    again, first = read_lora(out, CONFIG), read_lora(file, CONFIG)
-    for path, delta in first.items():
-        np.testing.assert_array_equal(again[path].down, delta.down)
-        np.testing.assert_array_equal(again[path].up, delta.up)
-
-
-def test_blocks_may_be_missing_and_ranks_differ(pairs, tmp_path):
-    kept = {name: pair for name, pair in pairs.items() if name.startswith("blocks.1.self_attn")}
-    down, up = kept["blocks.1.self_attn.q"]
-    kept["blocks.0.self_attn.q"] = (down[:1].clone(), up[:, :1].clone())
-    deltas = read_lora(written("diffusers", kept, tmp_path), CONFIG)
-    assert not deltas["blocks.self_attn.k"].up[0].any()
-    product = deltas["blocks.self_attn.q"].down[0] @ deltas["blocks.self_attn.q"].up[0]
-    expected = (ALPHA / RANK * up[:, :1] @ down[:1]).numpy().T
-    np.testing.assert_allclose(product, expected, rtol=1e-5, atol=1e-5)
-
-
-def test_a_fresh_summand_changes_nothing_until_it_is_trained():
-    made = network()
-    lora.start(made, 2, targets=CONFIG.lora_targets, rngs=nnx.Rngs(3))
-    np.testing.assert_array_equal(velocity(made), velocity(network()))
-    assert len(lora.deltas_of(made)) == 12
-    with pytest.raises(InputError, match="rank"):
-        lora.start(made, 0, targets=CONFIG.lora_targets, rngs=nnx.Rngs(3))
+def adapter(folder, tensors=None, **settings):
+    """A folder with an adapter and PEFT's settings."""
+    folder.mkdir(exist_ok=True)
+    name = "base_model.model.blocks.0.self_attn.q"
+    tensors = pair(rank=RANK, name=name) if tensors is None else tensors
+    save(folder / "adapter_model.safetensors", tensors)
+    (folder / "adapter_config.json").write_text(json.dumps(PEFT | settings), encoding="utf-8")
+    return folder
 
 
 @pytest.mark.parametrize(
-    ("patterns", "message"),
+    "settings",
     [
-        ({"targets": ("layers.*",)}, r"none matches .*layers\.\*.*lora_targets"),
-        ({"targets": ("blocks.*",), "also_train": ("input.*",)}, r"none of input\.\*"),
+        *({"init_lora_weights": value} for value in (True, False, "gaussian", "eva", "orthogonal")),
+        {"use_dora": False, "modules_to_save": None, "layer_replication": None, "lora_bias": False},
+        {"lora_dropout": 0.1, "task_type": None, "inference_mode": True, "megatron_core": "x"},
+        {"alpha_pattern": {"blocks.0.self_attn.q": 6}, "rank_pattern": {}, "bias": "none"},
+        {"target_modules": "all-linear", "peft_version": "0.18.1"},
     ],
+    ids=str,
 )
-def test_patterns_of_a_lora_that_match_nothing_are_refused(patterns, message):
-    with pytest.raises(InputError, match=message):
-        lora.start(network(), 2, **patterns, rngs=nnx.Rngs(0))
+def test_the_config_next_to_the_file_is_applied(tmp_path, settings, capsys):
+    (change,) = read_lora(adapter(tmp_path / "a", **settings), CONFIG.dit).values()
+    down, up = pair(rank=RANK).values()
+    np.testing.assert_allclose(
+        change.down[0] @ change.up[0], (6 / 4 * up @ down).numpy().T, atol=1e-5
+    )
+    assert not capsys.readouterr().err
 
 
-def test_weights_trained_in_full_are_not_those_of_the_lora():
-    made = network()
-    lora.start(made, 2, targets=("blocks.*",), rngs=nnx.Rngs(0))
-    full = lora.full_weights(made, ("blocks.mlp.*",))
-    assert full.keys() == {
-        f"blocks.mlp.{p}.{w}" for p in ("up", "down") for w in ("kernel", "bias")
-    }
+REFUSED = {
+    "init_lora_weights": ["pissa", "pissa_niter_16", "olora", "corda", "loftq", "lora_ga", "new"],
+    "peft_type": ["LOKR", "LOHA", "ADALORA", "VERA"],
+    "use_dora": [True],
+    "alpha_pattern": [{"blocks.0.self_attn.q": 8}, [8]],
+    "fan_in_fan_out": [True],
+    "bias": ["all", "lora_only"],
+    "lora_bias": [True],
+    "modules_to_save": [["head"]],
+    "layer_replication": [[[0, 1], [0, 1]]],
+    "target_parameters": [["blocks.0.mlp.kernel"]],
+    "megatron_config": [{"tensor_model_parallel_size": 2}],
+    "a_setting_of_next_year": [0.5, True, "on"],
+    "lora_alpha": [0, None, "a", math.inf],
+    "use_rslora": ["perhaps"],
+    # of another adapter
+    "r": [16],
+    "target_modules": [["to_k"]],
+}
 
 
-def test_a_pair_for_a_layer_that_is_not_linear_is_refused():
-    class Conv(nnx.Module):
-        def __init__(self):
-            self.kernel = nnx.Param(jnp.ones((2, 3)))
-
-    other = nnx.Module()
-    other.conv = Conv()
-    delta = lora.Delta(down=np.ones((2, 1), np.float32), up=np.ones((1, 3), np.float32))
-    with pytest.raises(InputError, match="conv: is not a linear layer"):
-        lora.apply(other, {"conv": delta})
+@pytest.mark.parametrize("key", REFUSED)
+def test_a_setting_that_cannot_be_applied_is_named(tmp_path, key):
+    for value in REFUSED[key]:
+        named = "rank 4; expected 16" if key == "r" else key
+        with pytest.raises(InputError, match=named) as caught:
+            read_lora(adapter(tmp_path / "a", **{key: value}), CONFIG.dit)
+        assert "adapter_config.json" in str(caught.value)
 
 
-def test_what_is_no_lora_of_the_network_is_one_list(pairs, tmp_path):
-    base = "diffusion_model.blocks.0.self_attn"
-    bad = {
-        f"{base}.q.lora_A.weight": torch.rand(3, CONFIG.dim),
-        f"{base}.k.lora_A.weight": torch.rand(3, CONFIG.dim),
-        f"{base}.k.lora_B.weight": torch.rand(CONFIG.dim, 4),
-        f"{base}.v.diff": torch.rand(CONFIG.dim, 7),
-        "diffusion_model.blocks.99.self_attn.q.lora_A.weight": torch.rand(3, CONFIG.dim),
-    }
-    save_file(bad, tmp_path / "bad.safetensors")
-    with pytest.raises(InputError) as error:
-        read_lora(tmp_path / "bad.safetensors", CONFIG)
-    for reason in (
-        "q, block 0: has no lora_B", "expected (3, 48) and (48, 3)",
-        "v, block 0: has shape (7, 48)",
-        "blocks.99", "4 tensors",
-    ):  # fmt: skip
-        assert reason in str(error.value)
-    wide = {
-        f"{base}.q.lora_A.weight": torch.rand(3, 7),
-        f"{base}.q.lora_B.weight": torch.rand(7, 3),
-    }
-    save_file(wide, tmp_path / "bad.safetensors")
-    with pytest.raises(InputError, match="not of a LoRA of this network"):
-        read_lora(tmp_path / "bad.safetensors", CONFIG)
-    narrow = np.zeros((CONFIG.layers, 7, 3), np.float32)
-    wide = {"blocks.self_attn.q": lora.Delta(down=narrow, up=narrow.transpose(0, 2, 1))}
-    with pytest.raises(InputError, match="does not fit this network"):
-        lora.apply(network(), wide)
-    weights.save(tmp_path / "base" / "dit.safetensors", network())
-    args = ["lora", str(tmp_path / "bad.safetensors"), "--config", "debug", "--merge"]
-    assert main([*args, str(tmp_path / "base"), "--out", str(tmp_path / "out")]) == 2
+@pytest.mark.parametrize(
+    "header",
+    [
+        {"alpha_scale": "0.5"},
+        {"LoRA_Alpha_V2": "8"},
+        {"effective_rank": "64"},
+        {"rslora": "True"},
+        {"trainer": '{"scale_alpha": 0.5}'},
+    ],
+    ids=str,
+)
+def test_a_header_key_like_alpha_or_rank_that_is_not_understood_is_named(tmp_path, header):
+    ((key, value),) = header.items()
+    if value.startswith("{"):
+        ((key, value),) = json.loads(value).items()
+    file = save(tmp_path / "x.safetensors", pair(rank=RANK), header)
+    with pytest.raises(InputError, match=f"'{key}' '?{value}'?, which may be the strength"):
+        read_lora(file, CONFIG.dit)
+
+
+ALPHA = f"{NAME}.alpha"
+BAD = {
+    "two alphas in a header": (pair(), {"lora_alpha": "8", "network_alpha": "4"}, "is 8.* is 4"),
+    "two configs": (
+        pair(rank=4),
+        {"lora_alpha": "8", "lora_config": json.dumps(PEFT | {"target_modules": "x"})},
+        "lora_config of .* is 6.*is 8",
+    ),
+    "another alpha of a layer": (
+        pair() | {ALPHA: torch.tensor(1.0)}, {"lora_alpha": "4"}, "alpha 1; expected lora_alpha 4",
+    ),
+    "another rank": (pair(), {"lora_rank": "8", "lora_alpha": "8"}, "rank 2; expected 8"),
+    "lora_alpha 0": (pair(), {"lora_alpha": "0"}, "lora_alpha .*is 0"),
+    "a lora_alpha of 0 of a layer": (
+        pair() | {f"{NAME}.lora_alpha": torch.tensor(0.0)}, None, "lora_alpha .*is 0",
+    ),
+    "a damaged config": (pair(), {"lora_config": "{"}, "lora_config"),
+    "no alpha in a config": (pair(), {"peft_config": '{"r": 2}'}, "has no lora_alpha"),
+    "NaN in the header": (pair(), {"ss_network_alpha": "nan"}, "not a finite"),
+    "a word in the header": (pair(), {"alpha": "much"}, "not a finite"),
+    "NaN as alpha": (pair() | {ALPHA: torch.tensor(math.nan)}, None, "not a finite"),
+    "several alphas": (pair() | {ALPHA: torch.ones(2)}, None, "2 numbers as alpha"),
+    "an alpha too high": (pair() | {ALPHA: torch.tensor(3e38)}, None, "not finite"),
+    "infinite weights": ({k: v + math.inf for k, v in pair().items()}, None, "not finite"),
+    "an infinite delta": ({f"{NAME}.diff_b": torch.full((DIM,), math.inf)}, None, "not finite"),
+    "rank 0": (pair(rank=0), None, "has rank 0"),
+    "rank 5,000": (pair(rank=5000), None, "has rank 5000"),
+    "another width": (pair(dim=DIM + 1), None, r"block 0: has shapes \(2, 49\)"),
+    "two ranks": (
+        pair() | {f"{NAME}.lora_B.weight": torch.rand(DIM, 3)}, None, r"block 0: has shapes",
+    ),
+    "one factor": ({f"{NAME}.lora_A.weight": torch.rand(2, DIM)}, None, "block 0: has no lora_B"),
+    "another shape of a delta": (
+        {f"{NAME}.diff": torch.rand(DIM, 7)}, None, r"block 0: has shape \(7, 48\)",
+    ),
+    "a layer too many": (pair(name="blocks.30.self_attn.q"), None, "not of a layer"),
+    "a text encoder alone": (pair(name="lora_te_a"), None, "has no layers"),
+    "nothing": ({}, None, "has no layers"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_lora_that_would_do_harm_is_refused(tmp_path, name):
+    tensors, header, reason = BAD[name]
+    with pytest.raises(InputError, match=reason):
+        read_lora(save(tmp_path / "x.safetensors", tensors, header), CONFIG.dit)
+
+
+def test_all_tensors_that_do_not_fit_are_one_list(tmp_path, capsys):
+    other = "diffusion_model.blocks.99.self_attn.q"
+    bad = {f"{NAME}.lora_A.weight": torch.rand(3, DIM), f"{NAME}.diff": torch.rand(DIM, 7)}
+    file = save(tmp_path / "x.safetensors", bad | pair(name=other))
+    args = ["lora", file, "--config", "debug", "--out", tmp_path / "out" / "x.safetensors"]
+    said = one_line(capsys, 2, *args)
+    assert "3 tensors" in said
+    assert "blocks.99" in said
     assert not (tmp_path / "out").exists()
+
+
+def test_settings_next_to_two_files_are_of_pefts_own(tmp_path):
+    folder = adapter(tmp_path / "a")
+    other = save(folder / "other.safetensors", pair())
+    with pytest.raises(InputError, match=r"belongs to adapter_model\.safetensors, not to other"):
+        read_lora(other, CONFIG.dit)
+    assert read_lora(folder / "adapter_model.safetensors", CONFIG.dit).keys() == {LAYER}
+
+
+@pytest.mark.parametrize("infix", ["", ".modules_to_save", ".modules_to_save.default"])
+def test_modules_to_save_replace_the_weights_of_the_base(tmp_path, infix):
+    shape = arrays("dit")["head.linear.bias"].shape
+    bias = {f"base_model.model.head.head{infix}.bias": torch.ones(shape)}
+    tensors = pair(rank=RANK, name="base_model.model.blocks.0.self_attn.q") | bias
+    folder = adapter(tmp_path / "a", tensors, modules_to_save=["head.head"])
+    assert isinstance(read_lora(folder, CONFIG.dit)["head.linear.bias"], Value)
+    base = ours(tmp_path / "base", "dit")
+    args = ["lora", folder, "--config", "debug", "--merge", base, "--out", tmp_path / "out"]
+    assert main([str(arg) for arg in args]) == 0
+    merged = read_safetensors(tmp_path / "out" / "dit.safetensors")["head.linear.bias"]
+    assert (merged.array() == 1).all()
+    with pytest.raises(InputError, match=r"head\.head.*not of a layer"):
+        read_lora(adapter(tmp_path / "b", tensors), CONFIG.dit)
+
+
+def test_layers_of_a_text_encoder_are_skipped_with_a_message(tmp_path, capsys):
+    both = pair() | pair(name="lora_te_text_model_encoder_layers_0_mlp_fc1")
+    changes = read_lora(save(tmp_path / "x.safetensors", both), CONFIG.dit)
+    assert changes.keys() == {LAYER}
+    assert "skipped 2 tensors of a text encoder" in capsys.readouterr().err
+
+
+def test_ranks_of_blocks_may_differ(tmp_path):
+    second = pair(rank=1, name="diffusion_model.blocks.1.self_attn.q")
+    change = read_lora(save(tmp_path / "x.safetensors", pair() | second), CONFIG.dit)[LAYER]
+    for block, tensors in enumerate((pair(), second)):
+        down, up = tensors.values()
+        np.testing.assert_allclose(
+            change.down[block] @ change.up[block], (up @ down).numpy().T, atol=1e-5
+        )

@@ -73,7 +73,7 @@ def test_a_checkpoint_is_read_after_any_prefix(form, tmp_path):
     assert found.tensors.keys() == foreign().keys()
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", [*FORMS][1::3])
 def test_a_lora_is_read_after_the_same_prefixes(form, tmp_path):
     changes = read_lora(written(form, pair(name=LAYER_NAME), tmp_path), CONFIG.dit)
     down, up = pair().values()
@@ -83,21 +83,20 @@ def test_a_lora_is_read_after_the_same_prefixes(form, tmp_path):
     assert changes.keys() == {LAYER}
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "lora_unet_blocks_0_self_attn_q",
-        "lora_unet__blocks_0_self_attn_q",
-        "lora_unet__orig_mod_blocks_0_self_attn_q",
-        "lora_unet_blocks_0__orig_mod_self_attn_q",
-        "lycoris_blocks_0_self_attn_q",
-        "model.lora_unet_blocks_0_self_attn_q",
-        "base_model.model.model.blocks.0.self_attn.q",
-        "transformer.blocks.0.attn1.to_q",
-        "model.diffusion_model.blocks.0.self_attn.q",
-    ],
-)
-@pytest.mark.parametrize("ends", ["lora_A lora_B", "lora_down lora_up", "lora.down lora.up"])
+PROJECTS = [
+    ("lora_unet_blocks_0_self_attn_q", "lora_A lora_B"),
+    ("lora_unet__blocks_0_self_attn_q", "lora_down lora_up"),
+    ("lora_unet__orig_mod_blocks_0_self_attn_q", "lora.down lora.up"),
+    ("lora_unet_blocks_0__orig_mod_self_attn_q", "lora_down lora_up"),
+    ("lycoris_blocks_0_self_attn_q", "lora_A lora_B"),
+    ("model.lora_unet_blocks_0_self_attn_q", "lora_down lora_up"),
+    ("base_model.model.model.blocks.0.self_attn.q", "lora_A lora_B"),
+    ("transformer.blocks.0.attn1.to_q", "lora.down lora.up"),
+    ("model.diffusion_model.blocks.0.self_attn.q", "lora_down lora_up"),
+]
+
+
+@pytest.mark.parametrize(("name", "ends"), PROJECTS)
 def test_a_lora_is_read_in_the_names_of_every_project(name, ends, tmp_path):
     tensors = zip(ends.split(), pair().values(), strict=True)
     named = {f"{name}.{end}.weight": tensor for end, tensor in tensors}
@@ -155,7 +154,7 @@ def test_of_two_checkpoints_in_a_file_one_is_chosen(first, second, chosen, tmp_p
     )
 
 
-@pytest.mark.parametrize(("first", "second", "chosen"), TWINS)
+@pytest.mark.parametrize(("first", "second", "chosen"), TWINS[1:3])
 def test_of_two_loras_in_a_file_one_is_chosen(first, second, chosen, tmp_path, capsys):
     doubled = {name: 2 * tensor for name, tensor in pair(name=LAYER_NAME).items()}
     tensors = prefixed(pair(name=LAYER_NAME), first) | prefixed(doubled, second)
@@ -218,11 +217,12 @@ OTHERS = {
 }
 
 
-@pytest.mark.parametrize(("kind", "end"), [(k, e) for k, ends in OTHERS.items() for e in ends])
-def test_another_kind_of_adapter_is_named(kind, end, tmp_path):
-    tensors = pair() | {f"diffusion_model.{LAYER_NAME}.{end}": torch.rand(DIM)}
-    with pytest.raises(InputError, match=f"tensors of {kind}.*egosim convert weights"):
-        read_lora(save(tmp_path / "x.safetensors", tensors), CONFIG.dit)
+@pytest.mark.parametrize("kind", OTHERS)
+def test_another_kind_of_adapter_is_named(kind, tmp_path):
+    for end in OTHERS[kind]:
+        tensors = pair() | {f"diffusion_model.{LAYER_NAME}.{end}": torch.rand(DIM)}
+        with pytest.raises(InputError, match=f"tensors of {kind}.*egosim convert weights"):
+            read_lora(save(tmp_path / "x.safetensors", tensors), CONFIG.dit)
 
 
 @pytest.mark.parametrize(

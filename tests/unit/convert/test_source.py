@@ -1,9 +1,7 @@
 """Foreign checkpoints open in every published form, and damage is reported."""
 
 import json
-import struct
 
-import ml_dtypes
 import numpy as np
 import pytest
 import torch
@@ -14,60 +12,22 @@ from egosim_jax.convert.source import sources
 from egosim_jax.io.mapped import read_safetensors
 from egosim_jax.types import InputError
 
-DTYPES = [
-    torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.float8_e4m3fn,
-    torch.float8_e5m2, torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8, torch.bool,
-]  # fmt: skip
 
-
-@pytest.mark.parametrize("dtype", DTYPES, ids=str)
-def test_safetensors_keep_their_bits(tmp_path, dtype):
-    values = (10 * torch.rand(3, 5)).to(dtype)
-    save_file({"a": values, "b": torch.rand(2)}, tmp_path / "x.safetensors", {"format": "pt"})
+def test_safetensors_keep_their_bits(tmp_path):
+    dtypes = (
+        torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.float8_e4m3fn,
+        torch.float8_e5m2, torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8,
+        torch.uint16, torch.uint32, torch.uint64, torch.bool,
+    )  # fmt: skip
+    values = {str(dtype): (10 * torch.rand(3, 5)).to(dtype) for dtype in dtypes}
+    save_file(values, tmp_path / "x.safetensors", {"format": "pt"})
     found = read_safetensors(tmp_path / "x.safetensors")
-    assert found.keys() == {"a", "b"}
-    array = found["a"].array()
-    assert f"torch.{array.dtype.name}" == str(dtype)
-    np.testing.assert_array_equal(array.view(np.uint8), values.view(torch.uint8).numpy())
-    assert not array.flags.writeable
-
-
-def written(path, header, body=bytes(16), length=None):
-    text = header if isinstance(header, bytes) else json.dumps(header).encode()
-    path.write_bytes(struct.pack("<Q", len(text) if length is None else length) + text + body)
-    return path
-
-
-def about(dtype="F32", shape=(4,), places=(0, 16)):
-    return {"dtype": dtype, "shape": list(shape), "data_offsets": list(places)}
-
-
-BROKEN = {
-    "header size, ": lambda p: written(p, {"a": about()}, length=1 << 40),
-    "header size,  ": lambda p: p.write_bytes(b"abc"),
-    "name 'a' is repeated": lambda p: written(
-        p, b'{"a": %s, "a": %s}' % ((json.dumps(about()).encode(),) * 2)
-    ),
-    "not a JSON object": lambda p: written(p, []),
-    "must have exactly": lambda p: written(p, {"a": {"dtype": "F32"}}),
-    "must have exactly ": lambda p: written(p, {"a": about(places=(0, 1, 2))}),
-    "unsupported dtype F4": lambda p: written(p, {"a": about(dtype="F4")}),
-    "has -4 where a size": lambda p: written(p, {"a": about(shape=(-4,))}),
-    "has 4.0 where a size": lambda p: written(p, {"a": about(shape=(4.0,))}),
-    "outside the file": lambda p: written(p, {"a": about(shape=(8,), places=(0, 32))}),
-    "not its size": lambda p: written(p, {"a": about(shape=(3,))}),
-    "not its size ": lambda p: written(p, {"a": about(places=(16, 0))}),
-    "Expecting property name": lambda p: written(p, b"{,}"),
-}
-
-
-@pytest.mark.parametrize("reason", BROKEN)
-def test_broken_safetensors_are_refused_with_the_reason(tmp_path, reason):
-    path = tmp_path / "x.safetensors"
-    BROKEN[reason](path)
-    with pytest.raises(InputError, match=reason.strip()) as error:
-        read_safetensors(path)
-    assert str(path) in str(error.value)
+    assert found.keys() == values.keys()
+    for name, tensor in found.items():
+        array = tensor.array()
+        assert f"torch.{array.dtype.name}" == name
+        np.testing.assert_array_equal(array.view(np.uint8), values[name].view(torch.uint8).numpy())
+        assert not array.flags.writeable
 
 
 def test_numbered_files_and_files_of_an_index_are_one_checkpoint(tmp_path):
@@ -92,15 +52,21 @@ def test_numbered_files_and_files_of_an_index_are_one_checkpoint(tmp_path):
         list(sources(tmp_path))
 
 
-def test_a_name_in_two_files_and_an_index_of_something_else_are_refused(tmp_path):
+def test_a_file_is_read_by_its_first_bytes(tmp_path):
+    torch.save({"a": torch.rand(2)}, tmp_path / "of_torch.ckpt")
+    save_file({"b": torch.rand(3)}, tmp_path / "of_safetensors.bin")
+    found = {source.name: [*source.tensors] for source in sources(tmp_path)}
+    assert found == {"of_safetensors.bin": ["b"], "of_torch.ckpt": ["a"]}
+    (quantized := tmp_path / "q.safetensors").write_bytes(b"GGUF" + bytes(60))
+    with pytest.raises(InputError, match="is a GGUF file"):
+        list(sources(quantized))
+
+
+def test_a_name_in_two_files_is_refused(tmp_path):
     for number in (1, 2):
         save_file({"a": torch.rand(2)}, tmp_path / f"m-{number:05d}-of-00002.safetensors")
     with pytest.raises(InputError, match="which another file of m also has"):
         list(sources(tmp_path))
-    for text in ("{}", "no json", '{"weight_map": {"a": "../m-00001-of-00002.safetensors"}}'):
-        (tmp_path / "m.safetensors.index.json").write_text(text, encoding="utf-8")
-        with pytest.raises(InputError, match="index"):
-            list(sources(tmp_path))
 
 
 def test_networks_are_detected_by_their_names_under_any_prefix(tmp_path):
@@ -149,10 +115,3 @@ def test_what_is_not_there_or_not_one_is_said(tmp_path):
         detect(tmp_path).network("image")
     with pytest.raises(InputError, match="0 checkpoints of the network dit"):
         detect(tmp_path).network("dit")
-
-
-def test_bfloat16_is_read_as_such(tmp_path):
-    save_file({"a": torch.tensor([1.5, -2.25]).bfloat16()}, tmp_path / "x.safetensors")
-    array = read_safetensors(tmp_path / "x.safetensors")["a"].array()
-    assert array.dtype == ml_dtypes.bfloat16
-    assert array.astype(np.float32).tolist() == [1.5, -2.25]

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from egosim_jax.data.shards import ShardWriter
-from egosim_jax.io.video import encode_video
+from egosim_jax.io.writing import encode_video
+from egosim_jax.types import VideoSpec
 from tests.unit.data.latent_records import (
     damage_record,
     first_shard,
@@ -75,7 +76,7 @@ def as_bytes(frames):
     ("prior", "hands", "message"),
     [
         (as_bytes(10), as_bytes(10), "prior of 10 frames cannot be encoded"),
-        (as_bytes(9), as_bytes(5), "the frame counts disagree"),
+        (as_bytes(9), as_bytes(5), "the frames and sizes disagree"),
         (as_bytes(9), np.zeros(99, np.uint8), "hands is not a readable video"),
     ],
 )
@@ -89,3 +90,14 @@ def test_check_decodes_every_image(tmp_path):
     with ShardWriter(tmp_path, kind="videos") as writer:
         writer.add({"first_frame": np.zeros(99, np.uint8)}, {"video_id": "a"})
     assert "first_frame is not a readable image" in problems(tmp_path)[0]
+
+
+@pytest.mark.parametrize("other", ["target", "prior", "hands", "mask", "first_frame"])
+def test_check_compares_the_sizes_of_all_frames(tmp_path, other):
+    spec = VideoSpec(frames=5, height=32, width=48, fps=8)
+    shape = {name: (5, 32, 48, 3) for name in ("target", "prior", "hands")}
+    shape |= {"mask": (5, 32, 48), "first_frame": (32, 48, 3)}
+    shape[other] = (*shape[other][:-2], 64, 3) if other != "mask" else (5, 32, 64)
+    with ShardWriter(tmp_path, kind="frames", spec=spec) as writer:
+        writer.add({n: np.zeros(s, np.uint8) for n, s in shape.items()}, {"video_id": "a"})
+    assert "the frames and sizes disagree" in problems(tmp_path)[0]

@@ -5,16 +5,19 @@ import io
 import os
 import subprocess
 import sys
+from fractions import Fraction
 
 import av
 import numpy as np
 import pytest
 from PIL import Image
 
+from egosim_jax.data.clip_files import prior_column, prior_problem
 from egosim_jax.data.clips import check_clip, load_triplet, write_clips
 from egosim_jax.data.metadata import csv_rows, read_metadata
 from egosim_jax.io.images import read_image
-from egosim_jax.io.video import read_video, write_video
+from egosim_jax.io.video import read_video
+from egosim_jax.io.writing import write_video
 from egosim_jax.types import InputError, Triplet, VideoSpec
 
 NATIVE = VideoSpec(frames=9, height=32, width=48)
@@ -72,13 +75,9 @@ def test_a_portrait_is_not_stretched_to_a_landscape_unless_it_is_wanted(files):
     assert load_triplet(files, tall, policy="lenient").prior.shape[1:3] == (64, 32)
 
 
-def test_a_longer_clip_gives_the_window_at_start(files):
+def test_a_longer_clip_gives_the_window_at_start_and_its_own_image(files):
     triplet = load_triplet(files, dataclasses.replace(NATIVE, frames=5), start=3)
     np.testing.assert_array_equal(triplet.hands, read_video(files.hands).frames[3:8])
-
-
-def test_the_image_is_the_clips_own_wherever_the_window_begins(files):
-    triplet = load_triplet(files, dataclasses.replace(NATIVE, frames=5), start=3)
     np.testing.assert_array_equal(triplet.first_frame, read_image(files.first_frame))
 
 
@@ -89,12 +88,9 @@ def test_the_first_frame_may_be_a_video(files):
     )
 
 
-def test_a_clip_without_truth_has_none(files):
-    assert load_triplet(dataclasses.replace(files, target=None), NATIVE).target is None
-
-
-def test_a_valid_clip_has_no_problems(files):
+def test_a_valid_clip_has_no_problems_also_without_truth(files):
     assert check_clip(files, NATIVE) == []
+    assert load_triplet(dataclasses.replace(files, target=None), NATIVE).target is None
 
 
 @pytest.mark.parametrize("name", ["prior", "hands", "mask", "first_frame", "target"])
@@ -106,46 +102,34 @@ def test_strict_refuses_a_missing_file_by_row_and_path(files, name):
     ]
 
 
-def test_every_missing_file_is_listed(files):
-    files.prior.unlink()
-    files.hands.unlink()
-    assert len(check_clip(files, NATIVE)) == 2
-
-
-def test_strict_refuses_frame_counts_that_disagree(files):
+def disagree_in_length(files):
     shorten(files.hands, 5)
-    with pytest.raises(InputError, match="disagree: prior 9, hands 5, mask 9, target 9") as caught:
-        load_triplet(files, NATIVE)
-    assert "(egosim generate --lenient repeats or cuts)" in str(caught.value)
 
 
-def test_strict_refuses_a_count_that_is_not_4k_plus_1(make_clips):
-    (files,) = read_metadata(make_clips(clips=1, frames=10))
-    with pytest.raises(InputError, match=r"10 frames cannot be encoded.*Nearest: 9 or 13"):
-        load_triplet(files, NATIVE)
-
-
-def test_strict_refuses_a_clip_shorter_than_the_window(files):
-    with pytest.raises(InputError, match="9 frames are fewer than the 12"):
-        load_triplet(files, NATIVE, start=3)
-
-
-def test_strict_refuses_sizes_that_disagree(files):
+def disagree_in_size(files):
     shrink(files.hands, 16, 48)
-    with pytest.raises(InputError, match="disagree: prior 48x32, hands 48x16"):
-        load_triplet(files, NATIVE)
 
 
-def test_strict_refuses_sizes_that_are_not_multiples_of_16(make_clips):
-    (files,) = read_metadata(make_clips(clips=1, height=24))
-    with pytest.raises(InputError, match="48x24 pixels: width and height must be multiples of 16"):
-        load_triplet(files, NATIVE)
-
-
-def test_strict_refuses_an_unreadable_video(files):
-    files.prior.write_bytes(b"no video")
-    with pytest.raises(InputError, match=r"ego_prior_video\.mp4 is not a readable video"):
-        load_triplet(files, NATIVE)
+@pytest.mark.parametrize(
+    ("clip", "change", "start", "message"),
+    [
+        ({}, disagree_in_length, 0, r"disagree: prior 9, hands 5, mask 9, target 9.*\(egosim gen"),
+        ({}, disagree_in_size, 0, "disagree: prior 48x32, hands 48x16"),
+        ({}, lambda files: cut_off(files.hands), 0, r"metadata\.csv line 2 \(clip0\).*is cut off"),
+        ({}, lambda files: files.prior.write_bytes(b"x"), 0, "prior.*is not a readable video"),
+        ({}, None, 3, "9 frames are fewer than the 12"),
+        ({"frames": 10}, None, 0, "10 frames cannot be encoded.*Nearest: 9 or 13"),
+        ({"height": 24}, None, 0, "48x24 pixels: width and height must be multiples of 16"),
+    ],
+)
+def test_strict_refuses_a_clip_that_would_have_to_be_changed(
+    make_clips, clip, change, start, message
+):
+    (files,) = read_metadata(make_clips(clips=1, **clip))
+    if change is not None:
+        change(files)
+    with pytest.raises(InputError, match=message):
+        load_triplet(files, NATIVE, start=start)
 
 
 def test_lenient_repeats_the_last_frame(files):
@@ -176,12 +160,9 @@ def test_lenient_takes_a_missing_mask_for_all_observed(files):
     assert not mask.any()
 
 
-def test_lenient_does_without_a_missing_truth(files):
+def test_lenient_does_without_a_missing_truth_but_not_without_a_prior(files):
     files.target.unlink()
     assert load_triplet(files, NATIVE, policy="lenient").target is None
-
-
-def test_lenient_still_refuses_a_missing_prior(files):
     files.prior.unlink()
     with pytest.raises(InputError, match="No such file"):
         load_triplet(files, NATIVE, policy="lenient")
@@ -189,7 +170,7 @@ def test_lenient_still_refuses_a_missing_prior(files):
 
 def test_clips_that_were_written_are_read_back(tmp_path):
     """Return True if smooth images differ no more than by 4:2:0 color and near-lossless H.264."""
-    spec = VideoSpec(frames=9, height=32, width=48)
+    spec = VideoSpec(frames=9, height=32, width=48, fps=8)
     frame, row, column = np.mgrid[:9, :32, :48]
     smooth = [
         np.stack([8 * frame + 3 * row, 4 * column, 60 * shift + row + column], axis=-1).astype(
@@ -263,13 +244,6 @@ def cut_off(path):
     path.write_bytes(data[: len(data) * 2 // 3])
 
 
-def test_strict_refuses_a_video_that_was_cut_off(files):
-    cut_off(files.hands)
-    (problem,) = check_clip(files, NATIVE)
-    assert "metadata.csv line 2 (clip0)" in problem
-    assert "is cut off" in problem
-
-
 def test_lenient_says_how_many_frames_of_a_cut_off_video_are_missing(files, caplog):
     cut_off(files.hands)
     triplet = load_triplet(files, NATIVE, policy="lenient")
@@ -277,12 +251,6 @@ def test_lenient_says_how_many_frames_of_a_cut_off_video_are_missing(files, capl
     assert 0 < have < 9
     np.testing.assert_array_equal(triplet.hands[have], triplet.hands[-1])
     assert f"{9 - have} of 9 frames are missing in {files.hands}" in caplog.text
-
-
-def test_lenient_says_how_many_frames_a_short_video_lacks(files, caplog):
-    shorten(files.prior, 5)
-    load_triplet(files, NATIVE, policy="lenient")
-    assert f"4 of 9 frames are missing in {files.prior}" in caplog.text
 
 
 def test_damage_behind_the_first_frame_is_refused_by_row(files):
@@ -296,7 +264,7 @@ def test_damage_behind_the_first_frame_is_refused_by_row(files):
 
 def test_a_clip_may_be_larger_than_memory_should_hold(files, monkeypatch):
     whole = load_triplet(files, dataclasses.replace(NATIVE, height=16, width=16))
-    monkeypatch.setattr("egosim_jax.io.decoding.MAX_KEPT", 9 * 16 * 16 * 3)
+    monkeypatch.setattr("egosim_jax.io.video.MAX_KEPT", 9 * 16 * 16 * 3)
     again = load_triplet(files, dataclasses.replace(NATIVE, height=16, width=16))
     np.testing.assert_array_equal(again.prior, whole.prior)
 
@@ -317,3 +285,48 @@ def test_a_pipe_or_a_name_with_nul_is_a_problem_of_its_clip(files, name):
     for path in (pipe, pipe.with_name("a\0.mp4")):
         (problem,) = check_clip(dataclasses.replace(files, **{name: path}), NATIVE)
         assert "not a regular file" in problem or "null" in problem
+
+
+@pytest.mark.parametrize(
+    ("rates", "rule", "expected"),
+    [
+        ((16, 16), "first", range(5)),
+        ((30, 16), "rate", (0, 2, 4, 6, 8)),
+        ((30, 8), "rate", (0, 4, 8)),
+        ((12, 8), "rate", (0, 2, 3, 5, 6)),
+        ((30, 8), "step", (0, 3, 6)),
+        ((Fraction(30000, 1001), 30), "first", range(5)),
+    ],
+)
+def test_frames_are_taken_at_the_models_rate(files, tmp_path, rates, rule, expected):
+    spec = dataclasses.replace(NATIVE, frames=5, fps=rates[1])
+    timed = at_rate(files, tmp_path, rates[0])
+    triplet = load_triplet(timed, spec, resampling=rule, policy="lenient")
+    every = load_triplet(timed, NATIVE, policy="lenient").prior
+    taken = every[[*expected, *[expected[-1]] * (5 - len(expected))]]
+    np.testing.assert_array_equal(triplet.prior, taken)
+
+
+@pytest.mark.parametrize(
+    ("fps", "rule"), [(8, "first"), (30, "first"), (16.5, "first"), (8, "rate")]
+)
+def test_clips_of_another_rate_are_refused(files, tmp_path, fps, rule):
+    with pytest.raises(InputError, match=f"{fps:g} frames a second are not the model's 16"):
+        load_triplet(at_rate(files, tmp_path, Fraction(fps)), NATIVE, resampling=rule)
+
+
+def at_rate(files, folder, fps):
+    """Return a clip whose videos have the same frames at another rate."""
+    changed = {}
+    for name in ("prior", "hands", "target", "mask"):
+        frames = read_video(getattr(files, name)).frames
+        changed[name] = folder / f"{name}.mp4"
+        write_video(changed[name], frames, fps)
+    return dataclasses.replace(files, **changed)
+
+
+def test_a_prior_of_another_kind_than_the_models_is_refused():
+    assert prior_column("static") == {}
+    assert prior_problem({}, "predicted") is None
+    assert prior_problem(prior_column("predicted"), "predicted") is None
+    assert "--prior static" in prior_problem(prior_column("predicted"), "static")

@@ -13,10 +13,10 @@ from egosim_jax.data.metadata import read_metadata
 from egosim_jax.data.pack import pack, read_triplets
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.data.transforms import decode_record, resample
-from egosim_jax.io.video import write_video
+from egosim_jax.io.writing import write_video
 from egosim_jax.types import InputError, Triplet, VideoSpec
 
-SPEC = VideoSpec(frames=5, height=32, width=48)
+SPEC = VideoSpec(frames=5, height=32, width=48, fps=8)
 
 
 def make_triplet(name, seed=0):
@@ -177,8 +177,8 @@ def clips_list(root):
 def test_rules_of_resampling_are_those_of_dwm():
     assert resample(100, 49, "first").tolist() == list(range(49))
     assert resample(190, 49, "stride").tolist() == list(range(0, 147, 3))
-    assert resample(278, 49, "rate", step=3).tolist() == list(range(0, 147, 3))
-    assert resample(60, 5, "rate", step=0).tolist() == [0, 1, 2, 3, 4]
+    assert resample(278, 49, "step", ratio=Fraction(30, 8)).tolist() == list(range(0, 147, 3))
+    assert resample(60, 5, "step", ratio=Fraction(1, 2)).tolist() == [0, 1, 2, 3, 4]
     assert resample(9, 5, "linspace").tolist() == [0, 2, 4, 6, 8]
     assert resample(8, 5, "linspace").tolist() == [0, 2, 4, 5, 7]  # half to even, as torch.round
     assert resample(3, 5, "linspace").tolist() == [0, 0, 1, 2, 2]
@@ -194,7 +194,7 @@ def test_frames_are_taken_at_intervals(root):
     with pytest.raises(InputError, match="14 frames cannot be encoded"):
         load_triplet(clip, SPEC)
     with pytest.raises(InputError, match="fewer than the 17"):
-        load_triplet(clip, VideoSpec(frames=17, height=32, width=48), resampling="stride")
+        load_triplet(clip, VideoSpec(frames=17, height=32, width=48, fps=8), resampling="stride")
     with pytest.raises(InputError, match="need a size"):
         list(pack([clip], out=root / "x", spec=None, provenance={}, resampling="rate"))
 

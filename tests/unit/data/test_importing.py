@@ -1,5 +1,7 @@
 """Imports resume, keep what other sources wrote, and name what they skip."""
 
+import shutil
+from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -51,7 +53,7 @@ def test_bad_entries_are_named_and_an_interrupted_import_resumes(tmp_path):
     read = []
     outcomes = run(Listed(names=("a", "bad", "b"), read=read), tmp_path)
     assert [o.problem for o in outcomes] == [None, "bad is damaged.", None]
-    (tmp_path / "b/recording.json").unlink()
+    shutil.rmtree(tmp_path / "b")
     outcomes = run(Listed(names=("a", "bad", "b"), read=read), tmp_path)
     assert [o.resumed for o in outcomes] == [True, False, False]
     assert read == ["a", "bad", "b", "bad", "b"]
@@ -79,6 +81,29 @@ def test_recordings_of_another_source_or_options_are_kept(tmp_path, change):
 def test_ids_that_collide_are_named(tmp_path):
     outcomes = run(Listed(names=("a", "a"), read=[]), tmp_path)
     assert "ids must be unique" in outcomes[1].problem
+
+
+@pytest.mark.parametrize("error", [InputError("refused"), KeyboardInterrupt()])
+def test_a_refused_or_interrupted_recording_leaves_nothing(tmp_path, error):
+    class Failing(Listed):
+        def find(self):
+            def read(folder):
+                World(frames=4).write_video(folder / "video.mp4")
+                raise error
+
+            yield Entry(recording_id="a", read=read, source=self.source)
+
+    with suppress(KeyboardInterrupt):
+        assert run(Failing(names=(), read=[]), tmp_path)[0].problem == "refused"
+    assert [path.name for path in tmp_path.iterdir()] == [".lock"]
+
+
+def test_a_folder_with_other_files_is_not_replaced(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a/video.mp4").write_bytes(b"mine")
+    (outcome,) = run(Listed(names=("a",), read=[]), tmp_path)
+    assert "Choose another path" in outcome.problem
+    assert (tmp_path / "a/video.mp4").read_bytes() == b"mine"
 
 
 def test_a_limit_reads_only_the_first_entries(tmp_path):
@@ -112,5 +137,3 @@ def test_the_command_reports_what_it_skips_and_resumes(tmp_path, capsys):
     assert "1 of 2 recordings imported" in printed.err
     assert main([*args, "--limit", "1"]) == 0
     assert "1 of them earlier" in capsys.readouterr().err
-    assert main(["data", "import", "trumans", str(tmp_path), "--out", str(tmp_path / "t")]) == 2
-    assert "SMPL-X" in capsys.readouterr().err

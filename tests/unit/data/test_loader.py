@@ -60,16 +60,11 @@ def test_a_dead_worker_process_ends_the_loader_with_a_code_to_run_again(source):
     assert caught.value.code == ExitCode.RESUBMIT
 
 
-def test_the_same_seed_gives_the_same_order(source):
-    assert numbers(make_loader(source, batch_size=4, seed=7), 9) == numbers(
-        make_loader(source, batch_size=4, seed=7), 9
+def test_the_seed_decides_the_order(source):
+    first, again, other = (
+        numbers(make_loader(source, batch_size=4, seed=seed), 9) for seed in (7, 7, 8)
     )
-
-
-def test_another_seed_gives_another_order(source):
-    assert numbers(make_loader(source, batch_size=4, seed=7), 9) != numbers(
-        make_loader(source, batch_size=4, seed=8), 9
-    )
+    assert first == again != other
 
 
 @pytest.mark.parametrize(("size", "processes"), [(5, 1), (4, 2), (20, 1), (16, 4), (32, 16)])
@@ -84,14 +79,6 @@ def test_one_pass_has_every_record_once_on_as_many_batches_of_all_processes(
     batches = [batch for batches in passes for batch in batches]
     assert {len(batch["x"]) for batch in batches} == {size // processes}
     seen = np.concatenate([batch["record"][batch["weight"] == 1] for batch in batches])
-    assert sorted(seen) == list(range(RECORDS))
-
-
-def test_two_processes_read_disjoint_halves_of_an_epoch(source):
-    seen = []
-    for p in range(2):
-        loader = make_loader(source, batch_size=4, seed=0, rows=range(p, 4, 2))
-        seen += [number for batch in numbers(loader, 3) for number in batch]
     assert sorted(seen) == list(range(RECORDS))
 
 
@@ -123,16 +110,6 @@ def test_any_rows_are_those_of_the_whole_batch_though_records_are_bad(damaged, r
     own.close()
 
 
-def test_random_numbers_belong_to_the_position_not_to_the_process(source):
-    def noise(**rows):
-        loader = make_loader(source, batch_size=4, seed=0, transform=Noise(), **rows)
-        return [next(loader)["noise"].tolist() for _ in range(3)]
-
-    alone = noise()
-    second = noise(rows=(1, 3))
-    assert second == [batch[1::2] for batch in alone]
-
-
 def test_random_numbers_differ_between_epochs(source):
     loader = make_loader(source, batch_size=RECORDS, seed=0, transform=Noise(), shuffle=False)
     assert set(next(loader)["noise"]).isdisjoint(next(loader)["noise"])
@@ -149,14 +126,6 @@ def test_a_restored_state_gives_the_same_next_100_records(source, workers):
     resumed.set_state(state)
     assert numbers(resumed, 25) == expected
     resumed.close()
-
-
-def test_workers_deal_out_the_same_order(source):
-    with_workers = make_loader(source, batch_size=4, seed=3, workers=2, transform=Noise())
-    without = make_loader(source, batch_size=4, seed=3, transform=Noise())
-    for _ in range(4):
-        np.testing.assert_array_equal(next(with_workers)["noise"], next(without)["noise"])
-    with_workers.close()
 
 
 @pytest.mark.parametrize("change", [{"seed": 4}, {"batch_size": 2}, {"shuffle": False}])
@@ -257,13 +226,6 @@ def test_rows_that_a_batch_does_not_have_are_refused(source, rows):
         make_loader(source, batch_size=5, seed=0, rows=rows)
     with pytest.raises(InputError, match=r"A batch of 5 has no rows.*from 0 to 4"):
         next(one_pass(source, batch_size=5, rows=rows))
-
-
-def test_records_of_which_none_can_be_read_end_the_loader(tmp_path):
-    with ShardWriter(tmp_path, kind="latents") as writer:
-        writer.add({"x": np.array([np.nan], np.float32)}, {"video_id": "a"})
-    with pytest.raises(InputError, match=r"Too many records cannot be read.*not finite"):
-        next(make_loader(ShardReader(tmp_path), batch_size=1, seed=0))
 
 
 def test_a_window_is_cut_from_all_videos_alike(tmp_path):

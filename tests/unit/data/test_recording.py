@@ -11,7 +11,7 @@ from egosim_jax.data.recording import Recording
 from egosim_jax.data.scene_points import ScenePoints
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.images import read_depth_image
-from egosim_jax.io.video import write_video
+from egosim_jax.io.writing import write_video
 from egosim_jax.types import InputError
 
 FRAMES, HEIGHT, WIDTH = 6, 24, 32

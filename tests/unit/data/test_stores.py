@@ -3,15 +3,16 @@
 import json
 import os
 import socket
+import sys
 from collections import Counter
 from pathlib import Path
 
+import fsspec
 import numpy as np
 import pytest
 from moto.server import ThreadedMotoServer
 from s3fs import S3FileSystem
 
-from egosim_jax.data import stores
 from egosim_jax.data.manifest import MANIFEST
 from egosim_jax.data.mixing import MIXTURE, open_shards
 from egosim_jax.data.shards import ShardReader
@@ -70,7 +71,6 @@ def server(dataset):
     with pytest.MonkeyPatch.context() as patch:
         for name, value in names.items():
             patch.setenv(name, value)
-        patch.setattr(stores, "WAIT_S", 0.01)
         files = S3FileSystem(skip_instance_cache=True)
         files.mkdir("bucket")
         files.put(f"{dataset}/", "bucket/data/latents/", recursive=True)
@@ -154,14 +154,13 @@ def test_a_mixture_reads_no_folder_outside_its_bucket(server, tmp_path, name):
 
 
 def test_a_broken_transfer_is_repeated(server, dataset, tmp_path):
-    server.cut = 8  # more than s3fs repeats itself
+    server.cut = 2
     folder = local_shards(ADDRESS, cache=tmp_path)
     assert server.cut == 0
     assert_equal_records(ShardReader(folder), ShardReader(dataset))
 
 
-def test_transfers_that_break_always_end_with_a_code_to_run_again(server, tmp_path, monkeypatch):
-    monkeypatch.setattr(stores, "TRIES", 1)
+def test_transfers_that_break_always_end_with_a_code_to_run_again(server, tmp_path):
     server.cut = 10**6
     with pytest.raises(ProcessExit, match="Run the same command again") as caught:
         local_shards(ADDRESS, cache=tmp_path)
@@ -172,27 +171,24 @@ def test_transfers_that_break_always_end_with_a_code_to_run_again(server, tmp_pa
 def test_a_shard_of_other_bytes_is_refused(server, dataset, tmp_path):
     server.files.put(f"{dataset}/", "bucket/damaged/", recursive=True)
     size = (dataset / "shard-00000.array_record").stat().st_size
-    server.files.pipe("bucket/damaged/shard-00000.array_record", os.urandom(size))
-    with pytest.raises(InputError, match="differs from its manifest"):
-        local_shards("s3://bucket/damaged", cache=tmp_path)
+    for count in (size, size + 1):
+        server.files.pipe("bucket/damaged/shard-00000.array_record", os.urandom(count))
+        with pytest.raises(InputError, match="differs from its manifest"):
+            local_shards("s3://bucket/damaged", cache=tmp_path)
     server.files.rm("bucket/damaged/shard-00000.array_record")
     with pytest.raises(InputError, match="is missing, although its manifest names it"):
         local_shards("s3://bucket/damaged", cache=tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("address", "message"),
+    "address",
     [
-        ("s3://nowhere/latents", "There is no bucket s3://nowhere"),
-        ("s3://bucket/nothing", "s3://bucket/nothing has no manifest.json"),
-        ("s3://private/latents", "may not be read.*credentials"),
-        ("s3://bucket/../x", "is not an address of shards"),
-        ("s3://id:secret@bucket/x", "is not an address of shards"),
-        ("http://127.0.0.1/x", "is not an address of shards"),
+        "s3://nowhere/latents", "s3://bucket/nothing", "s3://private/latents", "s3://bucket/../x",
+        "s3://id:secret@bucket/x", "none://bucket/x", "http://127.0.0.1/x::memory://y",
     ],
-)
-def test_an_address_without_shards_is_refused(server, tmp_path, address, message):
-    with pytest.raises(InputError, match=message) as caught:
+)  # fmt: skip
+def test_an_address_without_shards_is_refused(server, tmp_path, address):
+    with pytest.raises(InputError) as caught:
         local_shards(address, cache=tmp_path)
     assert SECRET not in str(caught.value)
     assert shards_asked(server) == 0
@@ -205,9 +201,13 @@ def test_more_than_the_limit_is_refused_before_it_is_copied(server, tmp_path):
 
 
 def test_a_missing_package_is_named_with_its_extra(tmp_path, monkeypatch):
-    def missing(*args, **options):
-        raise ImportError("Install gcsfs to access Google Storage")
-
-    monkeypatch.setattr("fsspec.filesystem", missing)
-    with pytest.raises(InputError, match=r"gcsfs.*pip install 'egosim-jax\[stores\]'"):
+    monkeypatch.setitem(sys.modules, "gcsfs", None)
+    with pytest.raises(InputError, match=r"gcsfs.*egosim-jax\[stores\]"):
         local_shards("gs://bucket/latents", cache=tmp_path)
+
+
+def test_every_store_of_fsspec_is_read(dataset, tmp_path):
+    files = fsspec.filesystem("memory")
+    files.put(f"{dataset}/", "/bucket/latents/", recursive=True)
+    folder = local_shards("memory://bucket/latents", cache=tmp_path)
+    assert_equal_records(ShardReader(folder), ShardReader(dataset))

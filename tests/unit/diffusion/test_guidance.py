@@ -1,7 +1,10 @@
+import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from egosim_jax.diffusion import Guidance
+from egosim_jax.types import InputError
 
 X = jnp.arange(32.0).reshape(2, 1, 2, 2, 4)
 T = jnp.array([1000.0, 500.0])
@@ -35,3 +38,31 @@ def test_scale_one_never_runs_the_unconditional_branch():
 def test_scale_zero_is_the_unconditional_velocity():
     guided = Guidance(scale=0.0).guide(with_prompt, without_prompt)(X, T)
     np.testing.assert_array_equal(guided, X - 1)
+
+
+def test_timesteps_outside_of_the_interval_are_not_guided():
+    ran = []
+
+    def counted(x, t):
+        jax.debug.callback(lambda _: ran.append(1), t[0])
+        return without_prompt(x, t)
+
+    guidance = Guidance(scale=3.0, interval=(400, 600))
+    guided = guidance.guide(with_prompt, counted)(X, T)
+    everywhere = Guidance(scale=3.0).guide(with_prompt, without_prompt)(X, T)
+    np.testing.assert_array_equal(guided[1], everywhere[1])
+    np.testing.assert_array_equal(guided[0], with_prompt(X, T)[0])
+    guidance.guide(with_prompt, counted)(X, jnp.array([1000.0, 700.0]))
+    jax.effects_barrier()
+    assert len(ran) == 1
+
+
+@pytest.mark.parametrize("interval", [(600, 400), (-1, 500), (0, 1001), (500, 500)])
+def test_empty_intervals_are_refused(interval):
+    with pytest.raises(InputError, match="--guidance-interval"):
+        Guidance(scale=2.0, interval=interval)
+
+
+def test_an_interval_without_guidance_is_refused():
+    with pytest.raises(InputError, match="no effect at scale 1"):
+        Guidance(interval=(0.0, 500.0))

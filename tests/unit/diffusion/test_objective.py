@@ -51,7 +51,7 @@ def test_the_true_velocity_has_no_error(x0):
 
 def test_elements_far_from_their_target_do_not_count(x0):
     noise, levels = jax.random.normal(jax.random.key(6), SHAPE), jnp.array([0.1, 0.5, 0.9])
-    away = jnp.full(SHAPE, 3.0).at[:, 0, 0, 0].set(60.0).at[0, 0, 0, 0, 0].set(jnp.nan)
+    away = jnp.full(SHAPE, 3.0).at[:, 0, 0, 0].set(50.01).at[0, 0, 0, 0, 0].set(jnp.nan)
 
     def errors(objective):
         return objective.loss_at(PROCESS, lambda x, t: noise - x0 + away, x0, noise, levels)
@@ -152,6 +152,20 @@ def test_logit_normal_levels_have_the_quantiles_of_the_shifted_sigmoid():
         u = 1 / (1 + math.exp(-z))
         # Five standard errors of the quantile, as above.
         assert sigma[int(quantile * DRAWS)] == pytest.approx(3 * u / (1 + 2 * u), abs=0.04)
+
+
+def test_half_of_the_levels_may_be_those_of_a_sampler():
+    process = RectifiedFlow()
+    drawn = np.asarray(Objective(sampler_steps=3).sample_times(process, jax.random.key(0), DRAWS))
+    levels = process.times(3)[:-1].astype(np.float32)
+    counts = [(drawn == level).sum() for level in levels]
+    # Five standard deviations of a binomial count; 0 at the end is never drawn.
+    np.testing.assert_allclose(counts, DRAWS / 6, atol=5 * math.sqrt(DRAWS * 5 / 36))
+    assert drawn.min() > 0
+    others = np.sort(drawn[~np.isin(drawn, levels)])
+    for quantile in (0.1, 0.5, 0.9):  # as below
+        expected = 5 * quantile / (1 + 4 * quantile)
+        assert others[int(quantile * len(others))] == pytest.approx(expected, abs=0.085)
 
 
 def test_diffsynth_levels_are_those_of_a_thousand_step_sampler_each_as_likely():

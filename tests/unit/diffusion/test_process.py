@@ -90,7 +90,7 @@ def test_data_noise_and_velocity_come_back_from_a_perfect_prediction(process):
 @pytest.mark.parametrize("process", EVERY)
 def test_a_compiled_process_equals_numpy(process):
     time = process.times(25)[:-1].astype(np.float32)
-    for function in (process.alpha, process.sigma, process.timesteps):
+    for function in (process.alpha, process.sigma, process.timesteps, process.warp):
         np.testing.assert_allclose(jax.jit(function)(time), function(time), rtol=1e-6)
 
 
@@ -102,6 +102,36 @@ def test_the_last_timestep_of_cogvideox_is_pure_noise_and_the_variance_one(snr_s
     assert (alpha[0], alpha[-1], sigma[0], sigma[-1]) == (1, 0, 0, 1)
     assert (np.diff(alpha) < 0).all()
     np.testing.assert_allclose(alpha**2 + sigma**2, 1, rtol=1e-14)
+
+
+@pytest.mark.parametrize("schedule", ["linear", "scaled_linear"])
+@pytest.mark.parametrize("snr_shift", [1.0, 3.0])
+def test_the_scales_are_those_of_betas_multiplied_one_by_one(schedule, snr_shift):
+    fields = {"beta_schedule": schedule, "snr_shift": snr_shift}
+    process, terminal = (
+        VariancePreserving(zero_terminal_snr=zero, **fields) for zero in (False, True)
+    )
+    kept, roots = 1.0, []
+    for n in range(1000):
+        share = n / 999
+        if schedule == "linear":
+            beta = 0.00085 + share * (0.012 - 0.00085)
+        else:
+            beta = (0.00085**0.5 + share * (0.012**0.5 - 0.00085**0.5)) ** 2
+        kept *= 1 - beta
+        snr = kept / (1 - kept) / snr_shift
+        roots.append((snr / (1 + snr)) ** 0.5)
+    times = np.arange(1, 1001) / 1000
+    np.testing.assert_allclose(process.alpha(times), roots, rtol=1e-10)
+    first, last = roots[0], roots[-1]
+    expected = [(root - last) * first / (first - last) for root in roots]
+    np.testing.assert_allclose(terminal.alpha(times), expected, atol=1e-10)
+
+
+def test_the_levels_of_wans_unipc_start_below_pure_noise():
+    process = RectifiedFlow.wan_unipc(3.0)
+    assert process.times(1)[0] == pytest.approx(3 * 0.999 / (1 + 2 * 0.999), rel=1e-12)
+    assert process.timesteps(process.times(1))[0] == 999
 
 
 def test_trailing_timesteps_start_at_the_last_and_leading_ones_end_at_the_first():
@@ -121,10 +151,10 @@ def test_given_timesteps_are_what_the_network_is_given():
     steps = [1000, 750, 500, 250]
     process = RectifiedFlow(shift=5.0, timestep_rounding="down")
     assert process.timesteps(process.times(steps)).tolist() == [*steps, 0]
-    steps = (999, 749, 499, 249)
-    assert VariancePreserving().timesteps(VariancePreserving().times(steps)).tolist()[:-1] == [
-        *steps
-    ]
+    process = VariancePreserving()
+    for steps in ((999, 749, 499, 249), (998, 0), range(999, -1, -1)):
+        assert process.timesteps(process.times(steps))[:-1].tolist() == [*steps]
+    assert process.timesteps(process.times(1000))[:-1].tolist() == [*range(999, -1, -1)]
 
 
 @pytest.mark.parametrize(
@@ -136,6 +166,7 @@ def test_given_timesteps_are_what_the_network_is_given():
         (RectifiedFlow(), [500, 0], "above 0"),
         (RectifiedFlow(sigma_max=0.999, prediction="epsilon"), (1000, 500), "needs signal"),
         (VariancePreserving(), [1000, 500], "at most 999"),
+        (VariancePreserving(), [500, -1], "above -1"),
         (VariancePreserving(), [998.5, 500], "integers"),
         (VariancePreserving(), 1001, "more than the 1000"),
         (VariancePreserving(), 0, "at least 1"),

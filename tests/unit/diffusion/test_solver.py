@@ -7,6 +7,7 @@ import pytest
 
 from egosim_jax.diffusion import (
     DDIM,
+    SOLVERS,
     DPMSolver,
     Euler,
     RectifiedFlow,
@@ -14,11 +15,24 @@ from egosim_jax.diffusion import (
     VariancePreserving,
     integrate,
 )
+from egosim_jax.diffusion.solver import integrate_keeping, integrate_visiting
 from egosim_jax.types import InputError
 
 PROCESS = RectifiedFlow(shift=2.0)
-SOLVERS = [Euler(), UniPC(order=1), UniPC(order=2), UniPC(order=3), DDIM(), DPMSolver()]
+DETERMINISTIC = [Euler(), UniPC(order=1), UniPC(order=2), UniPC(order=3), DDIM(), DPMSolver()]
 STOCHASTIC = [DDIM(eta=1.0), DPMSolver(stochastic=True)]
+
+
+def test_solvers_have_the_names_of_other_programs():
+    assert {name: SOLVERS.parse(name) for name in SOLVERS.built_in} == {
+        "euler": Euler(),
+        "unipc": UniPC(),
+        "wan": UniPC(),
+        "ddim": DDIM(),
+        "dpmpp_2m": DPMSolver(),
+        "dpmpp_2m_sde": DPMSolver(stochastic=True),
+    }
+    assert SOLVERS.parse("unipc --order 3") == UniPC(order=3)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +70,7 @@ def end_error(solver, x, steps):
 
 
 @pytest.mark.parametrize("steps", [1, 5])
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", DETERMINISTIC)
 def test_a_straight_path_ends_at_the_data(noise, solver, steps):
     data = jnp.roll(noise, 1)
     x = integrate(
@@ -72,7 +86,8 @@ def test_a_straight_path_ends_at_the_data(noise, solver, steps):
 
 
 @pytest.mark.parametrize(
-    ("solver", "order"), [(Euler(), 1), (UniPC(order=2), 2), (DDIM(), 1), (DPMSolver(), 2)]
+    ("solver", "order"),
+    [(Euler(), 1), (UniPC(order=2), 2), (DDIM(), 1), (DPMSolver(), 2)],
 )
 def test_half_the_step_divides_the_error_by_two_to_the_order(noise, solver, order):
     ratio = end_error(solver, noise, 16) / end_error(solver, noise, 32)
@@ -80,11 +95,13 @@ def test_half_the_step_divides_the_error_by_two_to_the_order(noise, solver, orde
     assert np.log2(ratio) == pytest.approx(order, abs=0.25)
 
 
-def test_unipc_of_8_steps_beats_euler_of_32(noise):
-    assert end_error(UniPC(), noise, 8) < end_error(Euler(), noise, 32)
+def test_unipc_of_8_steps_beats_euler_of_32_and_each_order_the_one_below(noise):
+    first, second, third = (end_error(UniPC(order=order), noise, 8) for order in (1, 2, 3))
+    assert third < second < first
+    assert second < end_error(Euler(), noise, 32)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", DETERMINISTIC)
 def test_the_velocity_is_traced_once_for_all_steps(noise, solver):
     calls = []
 
@@ -98,7 +115,7 @@ def test_the_velocity_is_traced_once_for_all_steps(noise, solver):
     assert calls == [(2,)]
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", DETERMINISTIC)
 def test_latents_stay_float32_when_the_network_computes_in_bfloat16(noise, solver):
     seen = []
 
@@ -142,6 +159,53 @@ def test_an_order_below_one_is_refused():
         UniPC(order=0)
 
 
+@pytest.mark.parametrize("process", [PROCESS, VariancePreserving(snr_shift=3.0)])
+def test_a_step_from_true_data_and_noise_ends_at_the_scales_of_its_end(process):
+    times = process.times(8)
+    alpha, sigma = process.alpha(times), process.sigma(times)
+    for eta in (0.0, 0.5, 1.0):
+        row = DDIM(eta=eta).coefficients(process, times)
+        np.testing.assert_allclose(row.data, alpha[1:], rtol=1e-12)
+        np.testing.assert_allclose(row.epsilon**2 + row.noise**2, sigma[1:] ** 2, atol=1e-12)
+        # The ancestral sampler draws from the posterior of the data and the latents.
+        ratio = alpha[:-1] * sigma[1:] / (sigma[:-1] * alpha[1:])
+        expected = eta * sigma[1:] * np.sqrt(1 - ratio**2)
+        np.testing.assert_allclose(row.noise, expected, atol=1e-12)
+    for stochastic in (False, True):
+        row = DPMSolver(stochastic=stochastic).coefficients(process, times)
+        total = row.keep * alpha[:-1] + row.data + row.before
+        np.testing.assert_allclose(total, alpha[1:], atol=1e-12)
+        left = (row.keep * sigma[:-1]) ** 2 + row.noise**2
+        np.testing.assert_allclose(left, sigma[1:] ** 2, atol=1e-12)
+        assert bool(row.noise[:-1].all()) == stochastic
+
+
+def test_only_the_first_steps_are_taken(noise):
+    x = integrate(
+        lambda x, t: jnp.ones_like(x), noise, process=PROCESS, solver=Euler(), steps=4, count=2
+    )
+    np.testing.assert_allclose(x, noise + PROCESS.times(4)[2] - 1, atol=1e-6)
+
+
+@pytest.mark.parametrize("keys", [None, jax.random.split(jax.random.key(1), 2)])
+def test_what_a_network_also_returns_is_kept_from_the_last_step(noise, keys):
+    solver = DDIM(eta=0.0 if keys is None else 1.0)
+    given = {"process": PROCESS, "solver": solver, "steps": 4, "keys": keys}
+    also = lambda x, t: (gaussian_velocity(x, t), (x, t))  # noqa: E731
+    x, (before, t) = integrate_keeping(also, noise, **given)
+    other, (also_before, _), visited = integrate_visiting(also, noise, **given)
+    np.testing.assert_allclose(x, integrate(gaussian_velocity, noise, **given), atol=1e-6)
+    np.testing.assert_allclose(other, x, atol=1e-6)
+    timesteps = PROCESS.timesteps(PROCESS.times(4)[:-1])
+    np.testing.assert_allclose(t, np.repeat(timesteps[-1], 2), rtol=1e-6)
+    np.testing.assert_allclose(visited.timesteps, timesteps, rtol=1e-6)
+    np.testing.assert_allclose(visited.latents[-1], before, atol=1e-6)
+    np.testing.assert_allclose(also_before, before, atol=1e-6)
+    for latents, output, time in zip(visited.latents, visited.outputs, timesteps, strict=True):
+        expected = gaussian_velocity(latents, jnp.full(2, time))
+        np.testing.assert_allclose(output, expected, atol=1e-5)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("solver", STOCHASTIC)
 @pytest.mark.parametrize("process", [PROCESS, VariancePreserving(snr_shift=3.0)])
@@ -180,7 +244,7 @@ def test_a_stochastic_solver_without_keys_is_refused(noise):
         integrate(gaussian_velocity, noise, process=PROCESS, solver=DDIM(eta=1.0), steps=2)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", DETERMINISTIC)
 def test_given_timesteps_are_visited(noise, solver):
     seen = []
 

@@ -11,13 +11,13 @@ from egosim_jax.configs.model import Networks
 from egosim_jax.convert.widen import Widening
 from egosim_jax.experiments.config import DWM
 from egosim_jax.experiments.dwm import run
-from egosim_jax.experiments.dwm_training import changed, widen
-from egosim_jax.experiments.dwm_variants import (
+from egosim_jax.experiments.dwm_training import (
     BASES,
-    PAPER,
     POSE_DIM,
     VARIANTS,
+    changed,
     poses_of,
+    widen,
     with_layout,
 )
 from egosim_jax.geometry import invert, transform
@@ -52,15 +52,6 @@ def test_every_model_of_the_comparison_has_networks_that_fit(name):
     assert BASES[VARIANTS[name].base].channels <= model.layout.channels
 
 
-def test_the_channels_are_those_of_the_paper():
-    channels = {name: variant.layout.channels for name, variant in VARIANTS.items()}
-    assert {channels[name] for name in ("full", "moving_only", "hand_mask", "untrained")} == {49}
-    assert {channels[name] for name in ("no_hands", "adaln_global", "adaln_frame")} == {33}
-    assert {channels[name] for name in ("image_base", "image_untrained")} == {48}
-    known = {*VARIANTS, "sdedit"}
-    assert all(names.keys() <= known for names in PAPER.values())
-
-
 def test_the_image_base_sees_the_first_frame_alone():
     found = changed(clip("a"), "image")
     assert (found.prior[0] == 200).all()
@@ -78,11 +69,6 @@ def test_the_painting_base_sees_what_is_not_masked_and_always_the_same():
         np.testing.assert_array_equal(found.mask, changed(clip(f"clip_{number}"), "inpaint").mask)
         shares.append(hidden[1:].mean())
     assert 0.3 < np.mean(np.array(shares) == 1) < 0.9
-
-
-def test_hands_become_a_binary_mask():
-    hands = changed(replace(clip("a"), hands=clip("a").hands), "mask").hands
-    assert (hands == 255).all()
 
 
 def test_poses_are_joints_in_the_camera_of_each_frame():

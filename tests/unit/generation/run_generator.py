@@ -9,6 +9,7 @@ import numpy as np
 
 from egosim_jax import configs
 from egosim_jax.configs.model import Networks
+from egosim_jax.diffusion import StepCache
 from egosim_jax.generation.generator import Generator
 from egosim_jax.models.wan.dit import WanDiTConfig
 from egosim_jax.sharding import make_mesh
@@ -24,6 +25,8 @@ CONFIG = dataclasses.replace(
     vae=dataclasses.replace(DEBUG.vae, dim_mult=(1, 1, 1, 1)),
     steps=2,
 )
+REUSING = dataclasses.replace(CONFIG, steps=8, cache=StepCache(threshold=0.3, first=2))
+"""The same model, which reuses predictions."""
 BATCH = 8
 MESHES = {(4, 2, 1): BATCH, (1, 1, 8): 1}
 """Data, fsdp, context; and how many clips: as many as there is room for, and one on all devices."""
@@ -43,7 +46,10 @@ def main(folder: Path) -> None:
         )
         generator = Generator(CONFIG, Networks.load(CONFIG, folder, mesh=mesh), mesh)
         clips = generator.generate(triplets[:count], range(count))
-        found[f"{sizes} latents"] = np.asarray(generator.latents(triplets[:count], range(count)))
+        reusing = Generator(REUSING, generator.networks, mesh)
+        for name, model in {"latents": generator, "reused": reusing}.items():
+            latents = model.latents(triplets[:count], range(count))
+            found[f"{sizes} {name}"] = np.asarray(latents)
         found[f"{sizes} frames"] = np.stack([clip.frames for clip in clips])
     generator = Generator(CONFIG, networks, make_mesh(MeshConfig(data=4, fsdp=2)))
     try:

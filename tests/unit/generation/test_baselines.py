@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from egosim_jax import configs
-from egosim_jax.cli.generate import Generate
 from egosim_jax.conditioning.condition import Condition
-from egosim_jax.diffusion import DDIM, Euler, Guidance, RectifiedFlow, VariancePreserving
-from egosim_jax.generation.batch import STRENGTH, BatchJob
+from egosim_jax.diffusion import Guidance
+from egosim_jax.generation.batch import BatchJob
 from egosim_jax.generation.generator import Generator, denoise
-from egosim_jax.types import InputError, Triplet
+from egosim_jax.types import Triplet
 from tests.parity.cogvideox_configs.dwm_tiny import CONFIG as DWM_TINY
 
 
@@ -60,13 +59,6 @@ def test_a_baseline_changes_the_conditions(triplet, tmp_path, baseline, without,
         assert recorder.hands.dtype == np.uint8
 
 
-def test_sdedit_begins_at_the_models_strength_or_its_default(debug_weights):
-    command = Generate(config="debug", weights=debug_weights, baseline="sdedit")
-    assert command._model().strength == STRENGTH
-    assert replace(command, strength=0.5)._model().strength == 0.5
-    assert replace(command, baseline="no_hands")._model().strength is None
-
-
 class Blind:
     """A denoiser that keeps what it is given and predicts that there is no noise."""
 
@@ -106,41 +98,3 @@ def test_sdedit_takes_the_last_steps_from_the_noised_prior():
         part = dit.condition[..., at[name].start - shift : at[name].stop - shift]
         assert not part.any(), name
     assert dit.condition[..., at["hands"].start - shift :].any()
-
-
-PROCESSES = {
-    "exact": RectifiedFlow(),
-    "bfloat16": RectifiedFlow(timestep_rounding="bfloat16"),
-    "down": RectifiedFlow.wan_unipc(5.0),
-    "epsilon": RectifiedFlow(prediction="epsilon", sigma_max=0.999),
-    "trailing": VariancePreserving(),
-    "leading": VariancePreserving(spacing="leading"),
-}
-
-
-@pytest.mark.parametrize("process", PROCESSES.values(), ids=PROCESSES)
-@pytest.mark.parametrize("steps", [1, 4, 100, 200, 333, 1000])
-@pytest.mark.parametrize("strength", [0.01, 0.31, 0.75, 1.0])
-def test_sdedit_visits_the_last_times_of_the_sampler(process, steps, strength):
-    """Also if their rounded timesteps repeat."""
-    solver = Euler() if isinstance(process, RectifiedFlow) else DDIM()
-    config = replace(
-        configs.get("debug"), process=process, steps=steps, strength=strength, solver=solver
-    )
-    times = process.times(steps)
-    visited = process.times(config.visited)
-    assert len(visited) == max(1, int(strength * steps)) + 1
-    np.testing.assert_allclose(visited, times[-len(visited) :], rtol=1e-14)
-
-
-@pytest.mark.parametrize("strength", [0.0, 1.5])
-def test_a_strength_outside_of_0_to_1_is_refused(strength):
-    with pytest.raises(InputError, match=rf"strength {strength}: .* at most 1.*\(--strength\)"):
-        replace(DWM_TINY, strength=strength)
-
-
-def test_another_baseline_is_another_job(tmp_path):
-    job = BatchJob(model=configs.get("debug"), out=tmp_path, weights=None, baseline="no_hands")
-    job.open()
-    with pytest.raises(Exception, match="baseline"):
-        replace(job, baseline="hand_mask").open()

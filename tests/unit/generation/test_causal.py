@@ -13,7 +13,7 @@ from egosim_jax import configs
 from egosim_jax.conditioning.condition import Condition
 from egosim_jax.configs.model import Networks
 from egosim_jax.diffusion.guidance import Guidance
-from egosim_jax.generation.causal import ChunkDenoiser, chunks_of
+from egosim_jax.generation.causal import ChunkDenoiser
 from egosim_jax.generation.generator import denoise
 from egosim_jax.models.chunks import Chunks
 from egosim_jax.models.wan.dit import WanDiTConfig
@@ -131,11 +131,6 @@ def test_conditions_of_another_number_or_length_are_refused(student):
 def test_what_no_student_can_be_is_refused(config, change, message):
     with pytest.raises(InputError, match=message):
         replace(config, **change)
-
-
-def test_a_model_of_whole_clips_has_no_chunks():
-    with pytest.raises(InputError, match="debug makes clips at once"):
-        chunks_of(DEBUG)
 
 
 def test_weights_of_another_kind_are_refused(tmp_path):

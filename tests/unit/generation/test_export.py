@@ -37,14 +37,3 @@ def test_an_id_outside_the_folder_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"video_id '\.\./evil' is not a valid file name"):
         write_conditions(tmp_path / "to", clip.state, to_action(clip), fps=8, video_id="../evil")
     assert not list(tmp_path.rglob("*"))
-
-
-def test_a_table_with_other_columns_is_refused(tmp_path):
-    clip = next(make_sequence(3, spec=SPEC))
-    path = write_conditions(tmp_path, clip.state, to_action(clip), fps=8, point_px=POINT_PX)
-    header, row = path.read_text().splitlines()
-    table = f"{header},split\n{row},test\n"
-    path.write_text(table)
-    with pytest.raises(InputError, match=r"must have the same columns, not .*split"):
-        write_conditions(tmp_path, clip.state, to_action(clip), fps=8, video_id="clip_2")
-    assert path.read_text() == table

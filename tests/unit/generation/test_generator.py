@@ -12,7 +12,7 @@ from flax import nnx
 
 from egosim_jax import configs
 from egosim_jax.conditioning.condition import Condition
-from egosim_jax.configs.model import ModelConfig, Networks
+from egosim_jax.configs.model import Networks
 from egosim_jax.diffusion import DDIM, DPMSolver, Guidance, VariancePreserving
 from egosim_jax.generation.compiled import CompiledFn
 from egosim_jax.generation.encoding import encode_condition, pack
@@ -123,12 +123,6 @@ def test_guidance_at_scale_two_extrapolates_from_the_empty_prompt(networks, cond
     )
 
 
-def test_a_clip_without_a_target_cannot_be_reconstructed(generator, triplets):
-    blind = dataclasses.replace(triplets[0], target=None)
-    with pytest.raises(InputError, match="tabletop_human_0_0: no target"):
-        generator.reconstruct([blind])
-
-
 def test_latents_that_are_not_finite_name_their_clips(networks, triplets):
     graph, state = nnx.split(networks)
     broken = nnx.merge(graph, jax.tree.map(jnp.copy, state))
@@ -152,43 +146,3 @@ def test_weights_of_another_model_are_refused(networks, tmp_path: Path):
     wider = dataclasses.replace(CONFIG, dit=dataclasses.replace(CONFIG.dit, ffn_dim=100))
     with pytest.raises(InputError, match=r"blocks\.mlp\.up\.kernel: has shape .*; expected .*100"):
         Networks.load(wider, tmp_path)
-
-
-def test_the_tokenizer_of_the_release_is_in_its_weights_folder():
-    config = configs.get("egosim_14b").at(Path("weights"))
-    assert config.tokenizer.kind == Path("weights/google/umt5-xxl")
-    assert DEBUG.at(Path("weights")) is DEBUG
-
-
-def test_networks_that_do_not_fit_each_other_are_refused():
-    with pytest.raises(InputError, match=r"dit\.text_dim is 64 but text\.dim is 4096"):
-        ModelConfig(name="odd", video=CONFIG.video, dit=CONFIG.dit, vae=CONFIG.vae)
-
-
-def test_one_count_numbers_the_functions_of_all_batch_sizes(generator, monkeypatch):
-    """A cache with the first function of each size; loading it is silent."""
-    lines, seen = [], set()
-
-    def compile(program, *args, about):
-        lines.append(about)
-        was_cached = program is generator.encode
-        seen.add(was_cached)
-        return was_cached
-
-    monkeypatch.setattr(CompiledFn, "compile", compile)
-    generator.compile(1, 2)
-    assert seen == {True, False}
-    assert [line.split(" (")[0] for line in lines] == [
-        "1 of 8: encode",
-        "2 of 8: noise",
-        "3 of 8: denoise",
-        "4 of 8: decode",
-        "5 of 8: encode for 2 clips at once",
-        "6 of 8: noise for 2 clips at once",
-        "7 of 8: denoise for 2 clips at once",
-        "8 of 8: decode for 2 clips at once",
-    ]
-    assert [number for number, line in enumerate(lines, 1) if "after 1 from the cache" in line] == [
-        2,
-        6,
-    ]

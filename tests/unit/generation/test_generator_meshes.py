@@ -29,9 +29,11 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
 def test_clips_of_a_mesh_are_those_of_one_device(found):
     """In float32: sums are taken in another order."""
     for mesh in ("(4, 2, 1)", "(1, 1, 8)"):
-        latents, frames = found[f"{mesh} latents"], found[f"{mesh} frames"].astype(int)
-        alone = found["None latents"][: len(latents)]
-        assert np.linalg.norm(latents - alone) / np.linalg.norm(alone) <= 1e-5
+        frames = found[f"{mesh} frames"].astype(int)
+        for name in ("latents", "reused"):
+            latents = found[f"{mesh} {name}"]
+            alone = found[f"None {name}"][: len(latents)]
+            assert np.linalg.norm(latents - alone) / np.linalg.norm(alone) <= 1e-5
         assert np.abs(frames - found["None frames"][: len(frames)]).max() <= 1
 
 

@@ -62,25 +62,13 @@ def test_the_folder_is_private(folder, double):
     assert len(list(folder.iterdir())) == 1
 
 
-def test_a_folder_that_others_can_write_is_not_used(folder, double):
-    folder.mkdir(parents=True)
-    folder.chmod(0o770)
-    for _ in range(2):
-        with pytest.warns(UserWarning, match="others may use it"):
-            cached_compile("double", GIVEN, double)
-    assert double.times == 2
-    assert not list(folder.iterdir())
-
-
 @pytest.mark.parametrize(
     "change",
     [
         lambda patch: patch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", "") + " "),
-        lambda patch: patch.setattr(executables, "_code", lambda: "of tomorrow"),
-        lambda patch: patch.setattr(executables, "_processor", lambda: "another"),
         lambda patch: patch.setattr(executables.metadata, "version", lambda name: "9"),
     ],
-    ids=["flags", "code", "processor", "versions"],
+    ids=["flags", "versions"],
 )
 def test_each_dependency_is_part_of_the_key(folder, double, change, monkeypatch):
     cached_compile("double", GIVEN, double)
@@ -165,17 +153,6 @@ def test_another_key_or_shape_is_another_function(folder, double):
     assert double.times == 3
 
 
-def test_a_damaged_file_is_compiled_again(folder, double):
-    cached_compile("double", GIVEN, double)
-    (path,) = folder.iterdir()
-    path.write_bytes(path.read_bytes()[:100])
-    with pytest.warns(UserWarning, match="damaged"):
-        cached_compile("double", GIVEN, double)
-    assert double.times == 2
-    cached_compile("double", GIVEN, double)
-    assert double.times == 2
-
-
 def test_every_flipped_bit_is_noticed_before_anything_is_loaded(folder, double, monkeypatch):
     cached_compile("double", GIVEN, double)
     (path,) = folder.iterdir()
@@ -220,8 +197,9 @@ def test_a_file_that_others_could_have_written_is_not_loaded(folder, double, cha
         (lambda folder: os.chown(folder, 12345, -1), "belongs to user 12345"),
         (lambda folder: folder.symlink_to(folder.rename(folder.with_name("else"))), "is a link"),
         (lambda folder: folder.parent.parent.chmod(0o777), "others may rename it"),
+        (lambda folder: folder.chmod(0o770), "others may use it"),
     ],
-    ids=["owner", "link", "above"],
+    ids=["owner", "link", "above", "mode"],
 )
 def test_a_folder_that_others_could_change_is_not_used(folder, double, change, why):
     cached_compile("double", GIVEN, double)
@@ -309,12 +287,9 @@ def test_jax_compiles_again_what_was_cut_off(with_jax):
     ("change", "why"),
     [
         (lambda folder: folder.chmod(0o777), "others may use it"),
-        (lambda folder: os.chown(next(folder.iterdir()), 12345, -1), "belongs to user 12345"),
-        (lambda folder: os.link(next(folder.iterdir()), folder.parent / "second"), "2 names"),
-        (lambda folder: (folder / "linked").symlink_to("/etc"), "not a regular file"),
         (lambda folder: ((folder / "a").mkdir(), (folder / "a/b").symlink_to("c")), "a/b. Remove"),
     ],
-    ids=["mode", "owner", "hard link", "symbolic link", "below"],
+    ids=["mode", "link below"],
 )
 def test_jax_does_not_read_what_others_could_have_written(with_jax, change, why):
     folder, want, run = with_jax
@@ -418,13 +393,6 @@ def test_a_network_with_a_function_without_a_name_is_traced_again(folder, networ
         cached_trace("network", network)
         assert network.times == times
     assert not list(folder.iterdir())
-
-
-def test_a_network_of_other_code_is_traced_again(folder, network, monkeypatch):
-    cached_trace("network", network)
-    monkeypatch.setattr(executables, "_code", lambda: "of tomorrow")
-    cached_trace("network", network)
-    assert network.times == 2
 
 
 def test_a_damaged_network_is_traced_again(folder, network):

@@ -145,6 +145,13 @@ def test_a_mutable_field_may_change_and_is_recorded(tmp_path):
     assert "mesh.fsdp" not in str(refused.value)
 
 
+def test_a_run_that_has_not_begun_takes_another_config(tmp_path):
+    open_folder(tmp_path, {"seed": 0})
+    open_folder(tmp_path, {"seed": 1}, begun=False)
+    with pytest.raises(InputError, match="seed"):
+        open_folder(tmp_path, {"seed": 2})
+
+
 @pytest.mark.parametrize(
     ("recorded", "wanted", "message"),
     [

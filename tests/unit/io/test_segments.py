@@ -1,4 +1,4 @@
-"""Segments of videos: the same frames as decoding everything, for any codec and frame order."""
+"""Ranges of videos: the same frames as decoding everything, for any codec and frame order."""
 
 from fractions import Fraction
 
@@ -6,8 +6,7 @@ import av
 import numpy as np
 import pytest
 
-from egosim_jax.io.segments import probe_long_video, read_segment
-from egosim_jax.io.video import read_video
+from egosim_jax.io.video import probe_video, read_moments, read_video
 from egosim_jax.types import InputError
 
 CODECS = {
@@ -16,14 +15,14 @@ CODECS = {
 }
 
 
-def write(path, *, codec="libx264", count=40, options=None, times=None):
+def write(path, *, codec="libx264", count=40, options=None, times=None, size=64):
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=30)
-        stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv420p"
+        stream.width, stream.height, stream.pix_fmt = size, size, "yuv420p"
         stream.options = options or CODECS[codec]
         stream.codec_context.time_base = Fraction(1, 600)
         for index in range(count):
-            frame = np.full((64, 64, 3), 3 * index, np.uint8)
+            frame = np.full((size, size, 3), 3 * index, np.uint8)
             frame[:, : index + 1] = 255 - 3 * index
             coded = av.VideoFrame.from_ndarray(frame, format="rgb24")
             coded.pts = 20 * index if times is None else times[index]
@@ -38,7 +37,7 @@ def test_a_segment_has_the_frames_of_the_whole_video(tmp_path, codec):
     path = write(tmp_path / "video.mp4", codec=codec)
     every = read_video(path).frames
     for start, count in ((0, 40), (5, 3), (6, 2), (7, 9), (13, 1), (39, 1)):
-        segment = read_segment(path, start=start, count=count).frames
+        segment = read_video(path, start=start, stop=start + count).frames
         np.testing.assert_array_equal(segment, every[start : start + count])
 
 
@@ -46,44 +45,83 @@ def test_frames_are_counted_where_the_rate_varies(tmp_path):
     times = np.cumsum([20 + 15 * (index % 4 == 0) for index in range(40)]).tolist()
     path = write(tmp_path / "video.mp4", times=times)
     np.testing.assert_array_equal(
-        read_segment(path, start=20, count=4).frames, read_video(path).frames[20:24]
+        read_video(path, start=20, stop=24).frames, read_video(path).frames[20:24]
     )
 
 
 def test_a_pause_is_refused_with_the_command_that_converts(tmp_path):
-    assert probe_long_video(write(tmp_path / "even.mp4")).fps == 30
+    assert probe_video(write(tmp_path / "even.mp4")).fps == 30
     times = [20 * index + (300 if index >= 20 else 0) for index in range(40)]  # a pause of 0.5 s
     path = write(tmp_path / "pause.mp4", times=times)
     with pytest.raises(
         InputError, match=r"variable frame rate: .*0\.63 and 1\.17 s.*-vf fps=30 OUT"
     ):
-        probe_long_video(path)
+        probe_video(path)
     with pytest.raises(InputError, match="variable frame rate"):
-        read_segment(path, start=24, count=2)
-    assert len(read_segment(path, start=0, count=20).frames) == 20
-
-
-def test_a_video_longer_than_what_is_decoded_at_once_is_probed_and_read(tmp_path, monkeypatch):
-    path = write(tmp_path / "video.mp4")
-    monkeypatch.setattr("egosim_jax.io.decoding.MAX_PIXELS", 20 * 64 * 64)
-    with pytest.raises(InputError, match="pixels"):
-        read_video(path)
-    assert probe_long_video(path).frames == 40
-    assert len(read_segment(path, start=30, count=8).frames) == 8
+        read_video(path, start=24, stop=26)
+    assert len(read_video(path, start=0, stop=20).frames) == 20
 
 
 def test_frames_beyond_the_end_are_refused(tmp_path):
     path = write(tmp_path / "video.mp4")
     with pytest.raises(InputError, match="it has 40"):
-        read_segment(path, start=35, count=6)
+        read_video(path, start=35, stop=41, whole=True)
 
 
-def test_a_truncated_video_is_refused(tmp_path):
+def test_a_file_without_an_index_that_is_cut_off_is_refused_by_the_length_in_its_header(tmp_path):
     path = write(tmp_path / "video.mkv")
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
-    with pytest.raises(InputError):
-        read_segment(path, start=30, count=5)
+    for read in (probe_video, read_video):
+        with pytest.raises(InputError, match=r"cut off at 0\.\d s: its header says 1\.3 s"):
+            read(path)
+    assert 5 < len(read_video(path, damage="stop").frames) < 35
     path.write_bytes(data[:40])
     with pytest.raises(InputError):
-        probe_long_video(path)
+        probe_video(path)
+
+
+READS = [
+    probe_video,
+    read_video,
+    lambda path: read_video(path, start=70, stop=80, whole=True),
+    lambda path: read_moments(path, np.array([0.0, 0.1])),
+]
+
+
+@pytest.mark.parametrize("read", READS)
+@pytest.mark.parametrize("behind", [0.4, 0.9])
+def test_a_clock_that_begins_again_is_refused_by_every_reader(tmp_path, read, behind):
+    """As when captures whose clocks overlap are joined (`cat a.ts b.ts`)."""
+    first, second = (write(tmp_path / f"{name}.ts") for name in "ab")
+    with av.open(str(second)) as source, av.open(str(tmp_path / "c.ts"), "w") as target:
+        stream = target.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(video=0):
+            if packet.size:
+                packet.pts, packet.dts = (
+                    t + int(behind * 90_000) for t in (packet.pts, packet.dts)
+                )
+                packet.stream = stream
+                target.mux(packet)
+    (tmp_path / "joined.ts").write_bytes(first.read_bytes() + (tmp_path / "c.ts").read_bytes())
+    with pytest.raises(InputError, match=r"the clock of the file begins again.*-vf setpts="):
+        read(tmp_path / "joined.ts")
+
+
+def test_a_change_of_size_is_named_with_the_command_that_scales(tmp_path):
+    parts = [write(tmp_path / f"{size}.ts", size=size) for size in (64, 96)]
+    joined = tmp_path / "joined.ts"
+    with av.open(str(joined), "w") as target:
+        stream, shift = None, 0
+        for path in parts:
+            with av.open(str(path)) as source:
+                stream = stream or target.add_stream_from_template(source.streams.video[0])
+                for packet in source.demux(video=0):
+                    if packet.size:
+                        packet.pts, packet.dts = packet.pts + shift, packet.dts + shift
+                        packet.stream = stream
+                        target.mux(packet)
+            shift = 40 * 3000
+    with pytest.raises(InputError, match=r"from 64x64 to 96x96 at .*-vf scale=64:64 OUT"):
+        read_video(joined)
+    assert read_video(joined, stop=30).frames.shape == (30, 64, 64, 3)

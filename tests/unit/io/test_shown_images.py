@@ -177,7 +177,7 @@ REFUSED = {
             b"cHRM",
             struct.pack(">8I", 31270, 32900, 68000, 32000, 26500, 69000, 15000, 6000),
         ),
-        "primaries are others",
+        "primaries are not sRGB",
     ),
     "pq_png": (lambda: chunk(b"cICP", bytes([9, 16, 0, 1])), r"HDR \(PQ\)"),
     "hlg_png": (lambda: chunk(b"cICP", bytes([9, 18, 0, 1])), r"HDR \(HLG\)"),

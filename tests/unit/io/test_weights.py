@@ -1,6 +1,7 @@
 """Weights in our own format."""
 
 import os
+import shutil
 import subprocess
 import sys
 
@@ -107,3 +108,65 @@ assert jax.tree.structure(placed) == jax.tree.structure(abstract)
     other = nnx.State({"dit": nnx.state(skeleton().blocks)})
     with pytest.raises(WeightsError, match=r"head\.kernel: unexpected, with shape \(3, 2\)"):
         weights.place(tmp_path, other, other)
+
+
+def folders(tmp_path):
+    """A base of two networks, and the folder of a run that trained one of them."""
+    base, run = tmp_path / "base", tmp_path / "run" / "weights"
+    for seed, name in enumerate(("dit", "vae")):
+        weights.save(base / f"{name}.safetensors", Net(rngs=nnx.Rngs(seed)))
+    (base / "google").mkdir()
+    (base / "google" / "spiece.model").write_text("tokens", encoding="utf-8")
+    weights.save(run / "dit.safetensors", Net(rngs=nnx.Rngs(5)))
+    weights.add_others(run, base)
+    return base, run
+
+
+def test_a_runs_folder_is_complete_after_it_was_copied_and_its_base_removed(tmp_path):
+    base, run = folders(tmp_path)
+    want = {"dit": weights.hashes(run)["dit"], "vae": weights.hashes(base)["vae"]}
+    weights.save(base / "vae.safetensors", Net(rngs=nnx.Rngs(8)))  # another file in its place
+    assert weights.hashes(run) == want
+    copy = shutil.copytree(run, tmp_path / "copy", symlinks=True)
+    shutil.rmtree(base)
+    shutil.rmtree(run)
+    assert weights.hashes(copy) == want
+    assert (copy / "google" / "spiece.model").read_text(encoding="utf-8") == "tokens"
+    assert not any(path.is_symlink() for path in copy.rglob("*"))
+
+
+@pytest.mark.parametrize("where", ["base", "run"])
+def test_a_network_that_was_replaced_is_refused(tmp_path, where):
+    base, run = folders(tmp_path)
+    weights.save(tmp_path / "other.safetensors", Net(rngs=nnx.Rngs(8)))
+    # In place, as `cp` writes.
+    at = (base if where == "base" else run) / "vae.safetensors"
+    at.write_bytes((tmp_path / "other.safetensors").read_bytes())
+    for read in (weights.hashes, lambda folder: weights.check_record(folder, ["vae"])):
+        with pytest.raises(InputError, match=r"vae\.safetensors has the hash .*was replaced"):
+            read(run)
+    assert weights.hashes(run, only=["dit"]).keys() == {"dit"}
+    weights.check_record(run, ["dit"])
+
+
+def test_a_stopped_copy_is_finished_and_copies_on_another_disk(tmp_path, monkeypatch):
+    base, run = folders(tmp_path)
+    want = weights.hashes(run)
+    (run / "vae.safetensors").unlink()
+    monkeypatch.setattr(os, "link", lambda *_: os.stat(tmp_path / "nothing"))
+    weights.add_others(run, base)
+    assert weights.hashes(run) == want
+    assert not (run / "vae.safetensors").samefile(base / "vae.safetensors")
+
+
+def test_a_link_to_nothing_names_its_target(tmp_path):
+    for name in ("dit.safetensors", weights.STUDENT):
+        (tmp_path / name).symlink_to(tmp_path / "gone.safetensors")
+    for read in (
+        weights.hashes,
+        lambda folder: weights.check_folder(folder, "debug"),
+        lambda folder: weights.load(folder / "dit.safetensors", skeleton()),
+        lambda folder: weights.student_of(folder / "dit.safetensors", {"chunks": "1"}),
+    ):
+        with pytest.raises(InputError, match=r"is a link to .*gone\.safetensors, which does not"):
+            read(tmp_path)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from egosim_jax.geometry import invert, pixel_rays, pixels_of, transform
-from egosim_jax.perception.estimates import CameraEstimate, SparsePoints, Verdict
+from egosim_jax.perception.video.estimates import CameraEstimate, SparsePoints, Verdict
 from egosim_jax.types import VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND

@@ -9,12 +9,12 @@ import pytest
 from egosim_jax.geometry import invert, transform
 from egosim_jax.perception.classical import ClassicalConfig, HandMasks
 from egosim_jax.perception.oracle import OracleConfig
-from egosim_jax.perception.silhouettes import hand_silhouette
+from egosim_jax.perception.video.silhouettes import hand_silhouette
 from egosim_jax.rendering.reference import render
 from egosim_jax.state.fuse import fuse
 from egosim_jax.state.new_objects import is_among, without_ids
 from egosim_jax.types import Clip, VideoSpec
-from egosim_jax.worlds.tabletop import make_sequence, to_action, to_ground_truth
+from egosim_jax.worlds.tabletop import make_sequence, observation_of, to_action
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND
 
 SPEC = VideoSpec(frames=17, height=96, width=160, fps=8)
@@ -44,7 +44,7 @@ def test_the_object_that_was_carried_is_found(clip, found):
 def test_its_points_end_within_a_centimeter_of_where_it_is(clip, found):
     target = clip.body_ids[clip.target]
     points = clip.state.points_m[clip.state.object_ids == target].astype(float)
-    true = OracleConfig().build({0: to_ground_truth(clip)})(
+    true = OracleConfig().build({0: observation_of(clip)})(
         Clip(frames=clip.frames, fps=8), to_action(clip), clip.state
     )
     here = transform(found.world_from_object[target][-1], points)
@@ -151,18 +151,16 @@ def test_a_clip_that_leaves_an_object_at_rest_does_not_overrule_a_firm_grip(clip
     gap = (last - true[-1] @ invert(true[0])) @ true[0][:, 3]
     assert np.linalg.norm(gap) < 0.02
     (note,) = found.notes
-    assert f"carried {clip.target}, as its grip shows, but the clip shows it at rest" in note
+    assert f"carried {clip.target}, as predicted, but the clip shows it at rest" in note
 
 
-def test_a_motion_is_uncertain_if_the_fingers_do_not_show_a_hold(clip, found):
+def test_noise_of_a_video_does_not_hide_what_a_hand_carries(clip, found):
     assert found.notes == ()
     action, rng = to_action(clip), np.random.default_rng(0)
-    noise = rng.normal(0, 0.004, action.joints_m.shape)  # as in a video
+    noise = rng.normal(0, 0.004, action.joints_m.shape)
     shaken = replace(action, joints_m=(action.joints_m + noise).astype(action.joints_m.dtype))
     seen = ClassicalConfig().build()(Clip(frames=clip.frames, fps=8), shaken, clip.state)
     assert set(seen.world_from_object) == {clip.body_ids[clip.target]}
-    (note,) = seen.notes
-    assert note.endswith(f"may have held {clip.target}: its fingers do not show when")
 
 
 def test_without_hands_nothing_is_found(clip):
@@ -183,9 +181,9 @@ def test_what_is_seen_for_the_first_time_is_where_it_is(clip, found):
 
 
 def test_only_one_of_two_hands_on_an_object_moves_it(clip, found):
-    """A second hand next to the first, with the same motion."""
+    """A second hand around the same object, with the same motion."""
     action = to_action(clip)
-    second = action.joints_m + [0.02, 0, 0]
+    second = action.joints_m + [0.004, 0, 0]
     both = replace(action, joints_m=np.concatenate([second, action.joints_m], axis=1))
     twice = ClassicalConfig().build()(Clip(frames=clip.frames, fps=8), both, clip.state)
     assert twice.world_from_object.keys() == found.world_from_object.keys()

@@ -111,40 +111,27 @@ def test_each_file_is_read_once(tmp_path, monkeypatch):
     assert len(opened) == len(set(opened)) == 5
 
 
-def test_missing_or_damaged_files_are_named(tmp_path):
+def poses(**arrays):
+    values = {"data": np.zeros((FRAMES, 4, 4)), "inds": np.arange(FRAMES), **arrays}
+    return lambda folder: np.savez_compressed(folder / "pose" / "clip.npz", **values)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda f: (f / "depth" / "clip.zip").write_bytes(b"no zip"), r"clip\.zip is damaged"),
+        (lambda f: (f / "pose" / "clip.npz").unlink(), r"pose/clip\.npz is missing"),
+        (lambda f: (f / "mask" / "clip.txt").write_text("red cup\n"), "`id: phrase`"),
+        (lambda f: write(f, frames=4), "is for 4 frames, the clip has 5"),
+        (poses(data=np.zeros((3000, 3000))), "too large"),
+        (poses(data=np.zeros((FRAMES, 3, 3))), "not finite numbers"),
+    ],
+)
+def test_files_that_do_not_fit_a_clip_are_refused(tmp_path, damage, message):
     write(tmp_path)
-    read = RecordedConfig(folder=tmp_path, name="clip").build()
-    (tmp_path / "depth" / "clip.zip").write_bytes(b"not an archive")
-    with pytest.raises(InputError, match=r"clip\.zip is damaged"):
-        read(*asked())
-    (tmp_path / "pose" / "clip.npz").unlink()
-    with pytest.raises(InputError, match=r"pose/clip\.npz is missing"):
-        read(*asked())
-
-
-def test_another_number_of_frames_is_named(tmp_path):
-    write(tmp_path, frames=4)
-    with pytest.raises(InputError, match="is for 4 frames, the clip has 5"):
+    damage(tmp_path)
+    with pytest.raises(InputError, match=message):
         RecordedConfig(folder=tmp_path, name="clip").build()(*asked())
-
-
-def test_a_phrase_without_an_id_is_named(tmp_path):
-    write(tmp_path)
-    (tmp_path / "mask" / "clip.txt").write_text("red cup\n")
-    with pytest.raises(InputError, match="`id: phrase`"):
-        RecordedConfig(folder=tmp_path, name="clip").build()(*asked())
-
-
-def test_arrays_that_unpack_to_too_much_or_are_of_another_shape_are_refused(tmp_path):
-    write(tmp_path)
-    read = RecordedConfig(folder=tmp_path, name="clip").build()
-    path = tmp_path / "pose" / "clip.npz"
-    np.savez_compressed(path, data=np.zeros((3000, 3000)), inds=np.arange(FRAMES))
-    with pytest.raises(InputError, match="too large"):
-        read(*asked())
-    np.savez_compressed(path, data=np.zeros((FRAMES, 3, 3)), inds=np.arange(FRAMES))
-    with pytest.raises(InputError, match="not finite numbers"):
-        read(*asked())
 
 
 @pytest.mark.parametrize("kind", ["depth", "mask"])

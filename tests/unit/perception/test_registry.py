@@ -13,10 +13,14 @@ BUILT_IN = {"classical": "", "oracle": "", "recorded": " --folder x --name clip"
 
 
 @pytest.fixture(autouse=True)
-def clean(monkeypatch):
+def clean():
     for name in BUILT_IN:
         registry.get(name)
-    monkeypatch.setattr(registry, "_CONFIGS", dict(registry._CONFIGS))
+    registered = registry.PIPELINES.registered
+    before = dict(registered)
+    yield
+    registered.clear()
+    registered.update(before)
 
 
 @pytest.mark.parametrize(("name", "options"), BUILT_IN.items())
@@ -29,17 +33,15 @@ def test_every_pipeline_is_built_from_a_command_line(name, options):
 
 
 def test_each_threshold_is_an_option():
-    config = registry.parse("classical --motion.reach-m 0.05 --hands.discs 9")
-    assert (config.motion.reach_m, config.hands.discs) == (0.05, 9)
+    config = registry.parse("classical --motion.evidence 12 --hands.discs 9")
+    assert (config.motion.evidence, config.hands.discs) == (12, 9)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ("--hands.discs 0", "discs must be at least 1"),
-        ("--moved.point-px 0", "point_px must be at least 1"),
         ("--motion.blur-px 0", "blur_px must be positive"),
-        ("--motion.opening-tolerance-m 0", "opening_tolerance_m must be positive"),
         ("--motion.refinement.deviation-m 0", "deviation_m must be positive, or None"),
         ("--motion.refinement.steps-m 0.01", "one step per round"),
     ],
@@ -57,18 +59,20 @@ def test_a_changed_threshold_changes_the_fingerprint_of_the_pipeline():
     assert prints[0] == fingerprint(registry.parse("classical").build())
 
 
-@pytest.mark.parametrize("ground_truth", [None, {}])
-def test_the_oracle_needs_ground_truth(ground_truth):
-    with pytest.raises(InputError, match="'oracle' needs ground truth"):
-        registry.parse("oracle").build(ground_truth)
-
-
-@pytest.mark.parametrize("text", ["clasical", "", "nowhere_to_be_found:mine"])
-def test_an_unknown_pipeline_is_named_with_those_that_exist(text):
-    with pytest.raises(
-        InputError, match=r"classical, networks, oracle, recorded|cannot be imported"
-    ):
-        registry.parse(text)
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("clasical", "classical, networks, oracle, recorded"),
+        ("", "classical, networks, oracle, recorded"),
+        ("nowhere_to_be_found:mine", "cannot be imported"),
+        ("classical 'x", "not a name with options: No closing"),
+        (".x:mine", "'.x' is relative"),
+        ("oracle", "'oracle' needs ground truth"),
+    ],
+)
+def test_what_is_no_pipeline_is_refused(text, message):
+    with pytest.raises(InputError, match=message):
+        registry.parse(text).build({})
 
 
 def test_a_pipeline_of_a_user_is_found_by_name():
@@ -99,12 +103,3 @@ def test_a_module_that_registers_a_pipeline_is_imported(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     assert registry.parse("their_perception:theirs --size 4").size == 4
     del sys.modules["their_perception"]
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [("classical 'x", "not a name with options: No closing"), (".x:mine", "'.x' is relative")],
-)
-def test_a_text_without_a_pipeline_is_refused(text, message):
-    with pytest.raises(InputError, match=message):
-        registry.parse(text)

@@ -64,14 +64,13 @@ def test_finding_a_target_changes_nothing_of_the_process(monkeypatch):
 
 def test_every_device_has_its_data_sheet():
     for device in DEVICES.values():
-        facts = (device.flops, device.memory, device.bandwidth, device.link)
+        facts = (device.flops, device.memory, device.bandwidth)
         assert all(map(math.isfinite, facts))
         assert (device.chip is None) == (device.platform == "tpu")
         # In the documented units: from the slowest TPU to the fastest GPU.
         assert 1e14 < device.flops < 1e16
         assert 1e10 < device.memory < 1e12
         assert 5e11 < device.bandwidth < 1e13
-        assert 1e11 <= device.link < device.bandwidth
 
 
 def test_the_longest_matching_kind_counts():

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from egosim_jax.io.untrusted.pickled_models import read_model
-from egosim_jax.rendering.mano import ManoPoses, mano_hands, read_mano, read_poses, rotations_of
+from egosim_jax.rendering.mano import ManoPoses, mano_hands, read_mano, read_poses
 from egosim_jax.types import InputError
 from tests.mano import PARENTS, Called, Global, Made, dump, model_pickle, random_model
 
@@ -92,8 +92,8 @@ def test_without_a_left_model_the_left_hand_is_mirrored(model):
 
 def test_a_mirrored_hand_is_turned_from_the_camera_to_the_world_in_mirrored_axes(model):
     seen, mirror = make_poses(), np.diag([-1, 1, 1])
-    turn = rotations_of(np.array([0.4, -0.9, 0.2]))
-    turned = mirror @ turn @ mirror @ rotations_of(seen.global_orient[:, 0])
+    turn = Rotation.from_rotvec([0.4, -0.9, 0.2]).as_matrix()
+    turned = mirror @ turn @ mirror @ Rotation.from_rotvec(seen.global_orient[:, 0]).as_matrix()
     orient = seen.global_orient.copy()
     orient[:, 0] = Rotation.from_matrix(turned).as_rotvec()
     placed = replace(seen, global_orient=orient, translation_m=np.ones((3, 2, 3)))

@@ -1,14 +1,15 @@
 """The renderers in NumPy and JAX agree with each other and with a scalar loop."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from egosim_jax import rendering
-from egosim_jax.geometry import look_at
+from egosim_jax.geometry import look_at, rotation_z, transform
 from egosim_jax.rendering import Renderer, jitted, reference
-from egosim_jax.types import Cameras, InputError, SceneState
+from egosim_jax.types import Cameras, InputError, Motion, ObjectPath, SceneState
 
 DIFFERENT = 1e-3
 """Share of pixels that may differ: points on a pixel's edge round to either side in float32."""
@@ -253,6 +254,35 @@ FLAT = Cameras(
     height=HEIGHT,
     width=WIDTH,
 )
+
+
+@pytest.mark.parametrize("size", [1, 2])
+def test_both_renderers_draw_objects_on_their_predicted_paths(scene, size):
+    points, colors = scene
+    finite = np.isfinite(points).all(axis=1)
+    state = make_state(points[finite], colors[finite])
+    ids = np.arange(len(state.points_m), dtype=np.int32) % 3
+    state, cameras = replace(state, object_ids=ids), make_cameras()
+    rng = np.random.default_rng(5)
+    paths = {}
+    for number in (1, 2):
+        motion = np.repeat(np.eye(4)[None], 3, axis=0)
+        motion[:, :3, :3] = rotation_z(0.1 * number)
+        motion[1:, :3, 3] = rng.uniform(-0.3, 0.3, (2, 3))
+        paths[number] = ObjectPath(motion=motion, causes=(), confidence=1.0)
+    views = [
+        module.render(state, cameras, point_px=size, motion=Motion(paths=paths))
+        for module in (reference, jitted)
+    ]
+    for frame in range(3):  # as a state whose points were moved before
+        moved = state.points_m.copy()
+        for number, path in paths.items():
+            moved[ids == number] = transform(path.motion[frame], moved[ids == number].astype(float))
+        alone = replace(cameras, world_from_camera=cameras.world_from_camera[frame : frame + 1])
+        expected = reference.render(replace(state, points_m=moved), alone, point_px=size)
+        for view in views:
+            assert (view.object_ids[frame] != expected.object_ids[0]).mean() < DIFFERENT
+            assert (view.frames[frame] != expected.frames[0]).mean() < DIFFERENT
 
 
 def make_points(rows, columns, depth):

@@ -64,7 +64,8 @@ def test_the_report_says_what_is_reached(converted):
 
 
 def test_the_table_is_found_below_the_hands(episode):
-    pose = up_frame(episode.state, episode.actions[0].joints_m)
+    action = episode.actions[0]
+    pose = up_frame(episode.state, action.joints_m, action.cameras.world_from_camera[0])
     np.testing.assert_allclose(pose, np.eye(4), atol=2e-3)
 
 

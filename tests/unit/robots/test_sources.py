@@ -9,14 +9,15 @@ import pytest
 pytest.importorskip("mink")
 
 from egosim_jax.annotate.clip import ANNOTATION, MASKS, read_masks, write_masks
-from egosim_jax.interactive.server.store import Limits, Store
-from egosim_jax.io.video import write_video
+from egosim_jax.interactive.options import Limits
+from egosim_jax.interactive.server.store import Store
+from egosim_jax.io.writing import write_video
 from egosim_jax.robots.conversion import convert
 from egosim_jax.robots.sources import open_source
 from egosim_jax.simulation.rollout import load_clip
 from egosim_jax.state import snapshot
 from egosim_jax.types import InputError
-from egosim_jax.worlds.tabletop import to_episode, to_ground_truth
+from egosim_jax.worlds.tabletop import observation_of, to_episode
 from tests.painted import painted
 from tests.unit.annotate.stubs import config, textured_video, write
 from tests.unit.annotate.test_run import annotate
@@ -73,7 +74,7 @@ def test_a_simulation_has_its_generated_clips_and_what_it_perceived(simulated):
     ):
         shown = load_clip(simulated / f"clip_{number}/frames.npz", SPEC.fps).frames
         assert np.array_equal(truth.frames, shown)
-        known = to_ground_truth(clip)
+        known = observation_of(clip)
         for target, motion in truth.motions.items():
             np.testing.assert_allclose(motion, known.motions[target], atol=1e-6)
     after = snapshot.load(simulated / "clip_1/state")

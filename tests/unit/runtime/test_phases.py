@@ -32,8 +32,6 @@ main([*sys.argv[1:]])
     "words",
     [
         ["simulate", "--episode", "missing"],
-        ["generate", "--config", "debug", "--metadata", "missing"],
-        ["play", "--episode", "missing", "--port", "0"],
         ["serve", "--batch", "0"],
         ["train", "debug", "--training.steps", "0"],
     ],
@@ -49,33 +47,6 @@ def test_a_first_line_comes_before_the_slow_imports(words, tmp_path):
     loads = [number for number, line in enumerate(lines) if line.startswith("loads JAX")]
     if loads and "imports jax" in lines:
         assert loads[0] < lines.index("imports jax")
-
-
-def test_the_program_egosim_train_has_a_first_line_too(tmp_path):
-    script = WATCHED.replace("import main", "import train").replace(
-        "main([*sys.argv[1:]])", "train()"
-    )
-    command = [sys.executable, "-c", script, "debug", "--training.steps", "0"]
-    ran = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
-    lines = ran.stderr.splitlines()
-    assert lines[0] == "starts egosim-train"
-    assert "imports numpy" in lines
-
-
-def test_help_has_no_other_lines():
-    command = [sys.executable, "-c", WATCHED.replace("print(", "(lambda *a, **k: 0)("), "serve"]
-    ran = subprocess.run([*command, "--help"], capture_output=True, text=True, check=True)
-    assert ran.stderr == ""
-
-
-def test_library_use_prints_nothing(capsys):
-    with phase("loads"):
-        pass
-    with show_phases():
-        pass
-    with phase("loads"):
-        pass
-    assert capsys.readouterr() == ("", "")
 
 
 def test_a_log_has_a_line_per_phase_and_repeats_the_innermost(capsys, monkeypatch):

@@ -24,11 +24,3 @@ def test_an_unknown_option_is_compared_with_those_of_its_command(args, wanted, o
     assert ended.value.code == 2
     assert wanted in text
     assert other not in text
-
-
-@pytest.mark.parametrize("args", [["serve", "--help"], ["data", "import", "lerobot", "--help"]])
-def test_help_is_as_before(args, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(args)
-    assert ended.value.code == 0
-    assert f"usage: egosim {' '.join(args[:-1])}" in capsys.readouterr().out

@@ -21,7 +21,7 @@ from egosim_jax.simulation.simulator import Simulator
 from egosim_jax.state.snapshot import fingerprint
 from egosim_jax.state.tsdf import Fusion
 from egosim_jax.types import InputError, Perceived, VideoSpec
-from egosim_jax.worlds.tabletop import make_sequence, to_action, to_ground_truth
+from egosim_jax.worlds.tabletop import make_sequence, observation_of, to_action
 
 SPEC = VideoSpec(frames=5, height=48, width=80, fps=8)
 
@@ -42,7 +42,7 @@ def clips():
 
 def oracle(of=(0, 1)):
     """The oracle of clips in that order."""
-    ground_truth = {step: to_ground_truth(clips()[number]) for step, number in enumerate(of)}
+    ground_truth = {step: observation_of(clips()[number]) for step, number in enumerate(of)}
     return OracleConfig().build(ground_truth)
 
 

@@ -26,10 +26,10 @@ def clip():
 
 def test_step_does_not_change_the_state_it_is_given(clip):
     from egosim_jax.perception.oracle import OracleConfig
-    from egosim_jax.worlds.tabletop import to_ground_truth
+    from egosim_jax.worlds.tabletop import observation_of
 
     before = {f.name: np.array(getattr(clip.state, f.name)) for f in fields(clip.state)}
-    oracle = OracleConfig().build({0: to_ground_truth(clip)})
+    oracle = OracleConfig().build({0: observation_of(clip)})
     simulator = Simulator(generator=copy_the_view, perception=oracle, fps=8)
     step = simulator.step(clip.state, to_action(clip), seed=0)
     assert step.state.step == clip.state.step + 1
@@ -58,7 +58,7 @@ class Marked:
     point_px = 3
 
     renderer = SimpleNamespace(
-        render=lambda state, cameras, *, point_px: replace(
+        render=lambda state, cameras, *, point_px, motion=None: replace(
             reference.render(state, cameras, point_px=point_px),
             object_ids=np.full((5, 48, 80), 99, np.int32),
         ),

@@ -67,12 +67,14 @@ def cameras(count=6):
     return np.stack([motion(seed=10 + k) for k in range(count)])
 
 
+@pytest.mark.parametrize("distance_m", [1, 1e-3])
 @pytest.mark.parametrize(
     ("method", "scale"), [("centers", 0.4), ("orientations", 1.0), ("orientations and scale", 0.4)]
 )
-def test_cameras_known_in_both_give_the_motion_between(method, scale):
+def test_cameras_known_in_both_give_the_motion_between(method, scale, distance_m):
     truth = motion(scale)
     there, here = cameras(), cameras()
+    there[:, :3, 3] *= distance_m
     here[:, :3, :3] = truth[:3, :3] / scale @ there[:, :3, :3]
     here[:, :3, 3] = transform(truth, there[:, :3, 3])
     np.testing.assert_allclose(align_cameras(there, here, method=method), truth, atol=1e-10)
@@ -83,6 +85,14 @@ def test_one_camera_is_enough_for_a_rigid_alignment_and_leaves_the_scale_at_one(
     there = cameras(1)
     found = align_cameras(there, truth @ there, method="orientations and scale")
     np.testing.assert_allclose(found, truth, atol=1e-10)
+
+
+@pytest.mark.parametrize(("factor", "scale"), [(99, 99), (101, 1), (-1, 1)])
+def test_a_scale_that_is_noise_is_one(factor, scale):
+    there, here = cameras(), cameras()
+    here[:, :3, 3] *= factor
+    found = align_cameras(there, here, method="orientations and scale")
+    np.testing.assert_allclose(found[:3, :3], scale * np.eye(3), atol=1e-10)
 
 
 def test_a_camera_that_is_not_finite_is_named():

@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+import pytest
 
 from egosim_jax.state.depth import between_surfaces, state_from_depth
 from tests.boxes import GREEN, RED, cameras, cast
@@ -26,6 +27,15 @@ def test_a_smeared_edge_loses_the_points_between_its_surfaces():
     removed = between_surfaces(smeared, float(view.intrinsics_px[0, 0]))
     assert removed[between].mean() > 0.6
     assert removed[~between].mean() < 0.02
+
+
+@pytest.mark.parametrize(("length", "removed"), [(1, True), (6, True), (7, False)])
+def test_a_ramp_is_at_most_six_pixels_between_three_of_each_surface(length, removed):
+    depth = np.concatenate([np.full(3, 1.0), np.linspace(1, 2, length + 2)[1:-1], np.full(3, 2.0)])
+    found = between_surfaces(np.tile(depth, (2, 1)), 100.0)
+    expected = np.zeros(length + 6, bool)
+    expected[3:-3] = removed
+    np.testing.assert_array_equal(found, np.tile(expected, (2, 1)))
 
 
 def test_unknown_depth_is_between_nothing():

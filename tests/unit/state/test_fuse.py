@@ -102,7 +102,7 @@ def moved():
 
 def test_a_tracked_object_is_at_its_new_place_alone():
     state = moved()
-    assert at(start(), HERE) > 100
+    assert at(start(), HERE) > 180
     assert at(state, HERE) == 0
     assert at(state, THERE) > 100
     own = state.points_m[state.object_ids == 1]
@@ -191,6 +191,19 @@ def test_an_object_that_moved_untracked_leaves_no_ghost_points():
     state = fuse(start(), perceived(plates, interacted_frames={1: interacted}), fusion=COARSE)
     assert at(state, HERE, lower=0.015) == 0
     assert at(state, THERE) > 100
+    own = state.points_m[state.object_ids == 1]
+    assert (np.abs(own[:, :2] - THERE - 0.04).max(axis=1) < 0.046).all()
+
+
+@pytest.mark.parametrize(("distance_m", "kept"), [(0.004, True), (0.006, False)])
+def test_a_surface_within_5_mm_keeps_its_color(distance_m, kept):
+    clip = perceived([HERE] * FRAMES)
+    near = replace(clip, frames=255 - clip.frames, depth_m=clip.depth_m + np.float32(distance_m))
+    state = fuse(start(), near, fusion=COARSE)
+    new = state.points_m[:, 2] > TABLE_M + distance_m / 2
+    new &= (np.abs(state.points_m[:, :2]) < 0.1).all(axis=1) & (state.points_m[:, 2] < 1)
+    same = (state.colors[new] == [120, 110, 90]).all(axis=1)
+    assert same.mean() > 0.95 if kept else not same.any()
 
 
 def test_an_object_that_was_carried_away_has_disappeared():
@@ -241,6 +254,13 @@ def test_an_empty_mask_where_depth_sees_through_removes_the_object(how):
     state = fuse(start(), perceived([None] * FRAMES, **changes), fusion=COARSE)
     assert at(state, HERE) == at(state, THERE) == 0
     assert not (state.object_ids == 1).any()
+
+
+def test_one_frame_that_sees_through_an_object_removes_it():
+    depth = np.full((FRAMES, HEIGHT, WIDTH), np.inf, np.float32)
+    depth[3] = TABLE_M
+    state = fuse(start(), perceived([None] * FRAMES, depth_m=depth), fusion=COARSE)
+    assert at(state, HERE) == 0
 
 
 def test_an_empty_mask_without_depth_moves_what_is_remembered():

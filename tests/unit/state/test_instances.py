@@ -67,6 +67,14 @@ def test_a_table_without_objects_has_none():
 
 
 @pytest.mark.parametrize(
+    ("foot_m", "others", "count"), [(0.05, [], 1), (0.12, [], 0), (0.12, [RED], 1)]
+)
+def test_an_object_stands_on_the_table_or_shows_its_upper_half_alone(foot_m, others, count):
+    found, _ = search([Box((0.05, 0, foot_m), (0.05, 0.05, 0.06), BLUE, 2), *others])
+    assert found.max() == count
+
+
+@pytest.mark.parametrize(
     "change",
     [
         pytest.param(lambda depth: np.round(depth, 3), id="quantized to millimeters"),

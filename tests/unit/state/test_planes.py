@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from egosim_jax.state.planes import fit_plane, support_planes
+from egosim_jax.geometry import invert, look_at, transform
+from egosim_jax.state.planes import fit_plane, support_planes, vertical
+from egosim_jax.types import SceneState
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -48,11 +50,52 @@ def test_two_searches_find_the_same_planes(room):
         np.testing.assert_array_equal(one.plane, other.plane)
 
 
-def test_too_few_points_have_no_plane(room):
-    assert support_planes(room[:20], UP) == []
+@pytest.mark.parametrize(("count", "planes"), [(29, 0), (30, 1)])
+def test_a_plane_has_at_least_30_points(count, planes):
+    flat = patch([0, 0, 0.7], [1, 0, 0], [0, 1, 0], count, noise_m=0)
+    assert len(support_planes(flat, UP)) == planes
 
 
 def test_a_plane_has_its_inliers(room):
     plane, inliers = fit_plane(room[:6000], 0.006)
     assert len(inliers) > 5900
     np.testing.assert_allclose(np.abs(plane[:3]), [0, 1, 0], atol=0.01)
+
+
+def scene(points_m, **provenance):
+    count = len(points_m)
+    return SceneState(
+        points_m=points_m.astype(np.float32),
+        colors=np.zeros((count, 3), np.uint8),
+        object_ids=np.zeros(count, np.int32),
+        last_seen=np.zeros(count, np.int32),
+        intrinsics_px=np.eye(3),
+        provenance=provenance,
+    )
+
+
+@pytest.mark.parametrize("eye", [[0, -0.5, 1.6], [0.3, -0.4, 2.0], [-0.8, 0.3, 1.2]])
+def test_up_is_the_normal_of_the_table_in_any_world(room, eye):
+    points = room[6000:]  # table, shelf, and the box on the table
+    camera = look_at(np.array(eye), np.array([0, 0.3, 0.7]), up=UP)
+    np.testing.assert_allclose(vertical(scene(points), camera), UP, atol=0.01)
+    local = transform(invert(camera), points)
+    up = vertical(scene(local), np.eye(4))
+    np.testing.assert_allclose(camera[:3, :3] @ up, UP, atol=0.01)
+
+
+def test_up_is_the_nearer_axis_without_a_camera(room):
+    points = room[6000:]
+    np.testing.assert_array_equal(vertical(scene(points)), UP)
+    for steep in (0.3, 0.9):  # a camera's own axes, however much it looks down
+        ahead = np.array([0, np.cos(steep), -np.sin(steep)])
+        camera = look_at(np.array([0, 0.3, 0.7]) - ahead, np.array([0, 0.3, 0.7]), up=UP)
+        local = transform(invert(camera), points)
+        np.testing.assert_array_equal(vertical(scene(local)), [0, -1, 0])
+
+
+def test_up_without_a_table_is_that_of_the_camera(room):
+    camera = look_at(np.array([0, -1.0, 1.0]), np.array([0, 1.0, 1.0]), up=UP)
+    np.testing.assert_allclose(vertical(scene(room[:6000]), camera), UP, atol=1e-6)
+    np.testing.assert_array_equal(vertical(scene(room[:5])), [0, -1, 0])
+    np.testing.assert_array_equal(vertical(scene(room, world="tabletop"), np.eye(4)), UP)

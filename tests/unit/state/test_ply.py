@@ -8,7 +8,7 @@ import open3d as o3d
 import pytest
 
 from egosim_jax.cli.view import View
-from egosim_jax.state.ply import MAX_HEADER, read_points
+from egosim_jax.state.ply import MAX_HEADER, read_points, read_triangles
 from egosim_jax.state.snapshot import read_ply, write_ply
 from egosim_jax.types import InputError, SceneState
 
@@ -137,6 +137,33 @@ def test_faces_after_the_points_are_skipped(read):
     assert len(read(header(more=more) + b"0 1 2 1 1 1\n3 4 5 1 1 1\n3 0 1 1\n").points_m) == 2
     with pytest.raises(InputError, match="specifies"):
         read(binary(more=more))
+
+
+def test_triangles_of_a_mesh_are_read_and_other_faces_refused(tmp_path):
+    def read(corners, last=(3, 0, 1, 1), order="<"):
+        more = f"element face 2\nproperty list uchar {corners} vertex_indices\n"
+        dtype = [("count", "u1"), ("v", {"int": "i4", "ushort": "u2"}[corners], 3)]
+        faces = np.array([(3, (0, 1, 0)), (last[0], last[1:])], dtype)
+        data = faces.astype(faces.dtype.newbyteorder(order)).tobytes()
+        (tmp_path / "a.ply").write_bytes(binary(order, more=more) + data)
+        return read_triangles(tmp_path / "a.ply").tolist()
+
+    expected = [[0, 1, 0], [0, 1, 1]]
+    assert read("int") == read("ushort") == read("int", order=">") == expected
+    for last in ((4, 0, 1, 1), (3, 0, 1, 2), (3, -1, 1, 1)):
+        with pytest.raises(InputError, match="not triangles of its 2 vertices"):
+            read("int", last)
+    (tmp_path / "a.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:-1])
+    with pytest.raises(InputError, match="damaged"):
+        read_triangles(tmp_path / "a.ply")
+    for points in (TEXT, binary()):
+        (tmp_path / "a.ply").write_bytes(points)
+        with pytest.raises(InputError, match="no triangles that can be read"):
+            read_triangles(tmp_path / "a.ply")
+
+
+def test_one_point_of_text_is_read(read):
+    assert len(read(header(count=1) + b"0 1 2 10 20 30\n").points_m) == 1
 
 
 def test_floats_are_colors_from_0_to_1(read):

@@ -83,34 +83,38 @@ def test_another_version_is_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("change", "message"),
     [
-        {"step": "4"},
-        {"step": True},
-        {"names": {"1": 5}},
-        {"names": []},
-        {"names": {"one": "cup"}},
-        {"provenance": {"world": None}},
-        {"world_from_object": {"2": [[1, 0], [0, 1]]}},
-        {"world_from_object": None},
-        {"held": []},
-        {"held": {"0": "2"}},
-        {"held": {"0": 1}},
-        {"held": {"left": 2}},
-        {"intrinsics_px": "eye"},
-        {"intrinsics_px": [[1, 0, 0], [0, 1, 0], [0, 0, None]]},
-        {"points": 7},
-        {"step": 5},
-        {"names": {"1": "blue cup", "2": "lid"}},
-        {"sha256": 0},
+        ({"step": "4"}, "not a count"),
+        ({"step": True}, "not a count"),
+        ({"step": -1}, "not a count"),
+        ({"names": {"1": 5}}, "names is not a mapping to text"),
+        ({"names": []}, "names is not a mapping to text"),
+        ({"names": {"one": "cup"}}, "not an object id"),
+        ({"names": {"1" * 12: "cup"}}, "not an object id"),
+        ({"provenance": {"world": None}}, "provenance is not a mapping"),
+        ({"world_from_object": {"2": [[1, 0], [0, 1]]}}, "is not 4 x 4 numbers"),
+        ({"world_from_object": None}, "not a mapping to poses"),
+        ({"held": []}, "held is not a mapping"),
+        ({"held": {"0": "2"}}, "held is not a mapping"),
+        ({"held": {"left": 2}}, "not an object id"),
+        ({"intrinsics_px": "eye"}, "is not 3 x 3 numbers"),
+        ({"intrinsics_px": [[1, 0, 0], [0, 1, 0], [0, 0, None]]}, "is not 3 x 3 numbers"),
+        ({"intrinsics_px": [[1, 0, 0], [0, 1, 0], [0, 1]]}, "is not 3 x 3 numbers"),
+        ({"intrinsics_px": [[1, 0, 0], [0, 1, 0], [0, 0, np.nan]]}, "is not finite"),
+        ({"held": {"0": 1}}, "was changed"),
+        ({"points": 7}, "was changed"),
+        ({"step": 5}, "was changed"),
+        ({"names": {"1": "blue cup", "2": "lid"}}, "was changed"),
+        ({"sha256": 0}, ""),
     ],
     ids=str,
 )
-def test_a_changed_description_is_named(tmp_path, change):
+def test_a_changed_description_is_named(tmp_path, change, message):
     save(tmp_path / "state", state())
     path = tmp_path / "state" / "state.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-    with pytest.raises(InputError, match="not a readable state"):
+    with pytest.raises(InputError, match=f"not a readable state.*{message}"):
         load(tmp_path / "state")
 
 

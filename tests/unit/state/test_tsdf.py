@@ -1,5 +1,7 @@
 """Surfaces of shapes whose depth a formula gives."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -107,6 +109,19 @@ def test_unknown_and_far_depths_leave_no_points():
             depths, np.zeros((3, HEIGHT, WIDTH, 3), np.uint8), path, fusion=Fusion()
         )
         assert points.shape == shades.shape == (0, 3)
+
+
+def test_a_surface_that_too_few_frames_observe_has_no_points():
+    pose = np.repeat(np.eye(4)[None], 3, axis=0)
+    pose[:, 0, 3] = 0, 5, 10
+    path = replace(cameras(3), world_from_camera=pose)
+    depths = np.full((3, HEIGHT, WIDTH), 0.5, np.float32)
+    colors = np.zeros((3, HEIGHT, WIDTH, 3), np.uint8)
+    for observations, has in ((1, True), (2, False)):
+        fusion = Fusion(voxel_m=0.01, observations=observations)
+        points, shades = surface(depths, colors, path, fusion=fusion)
+        assert points.shape == shades.shape == (len(points), 3)
+        assert (len(points) > 0) == has
 
 
 @pytest.mark.parametrize("unknown", [0.0, np.inf, np.nan, -1.0])

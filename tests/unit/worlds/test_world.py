@@ -16,8 +16,17 @@ from egosim_jax.worlds.tabletop import (
     to_action,
 )
 from egosim_jax.worlds.tabletop.hand_motion import Grip
-from egosim_jax.worlds.tabletop.hands import closure_for, frame_of, joints_of, side_of
+from egosim_jax.worlds.tabletop.hands import (
+    FLESH_M,
+    closure_for,
+    frame_of,
+    joints_of,
+    side_of,
+    touching,
+)
+from egosim_jax.worlds.tabletop.pushes import push_out
 from egosim_jax.worlds.tabletop.scene import sample_scene
+from egosim_jax.worlds.tabletop.solids import surface_of
 
 SPEC = VideoSpec(frames=5, height=32, width=48)
 GRAB, OPENED = closure_for("robot", 0.072), closure_for("robot", 0.095)
@@ -155,6 +164,54 @@ def test_a_pushed_body_pushes_others_but_not_furniture(cameras):
     _, world = world_of(BOX, cabinet).move(drive(cameras, *keys))
     np.testing.assert_array_equal(place_of(world, "green cabinet"), [0, 0.36, 0])
     assert place_of(world)[1] + 0.036 < 0.30 + 3e-3
+
+
+def depth_in_flesh(scenes, joints, kind, name="red box"):
+    """Return how deep a body is in the flesh of the first hand, at every frame in meters."""
+    return np.array(
+        [
+            FLESH_M[kind] - surface_of(scene, scene.body(name), touching(frame[0], kind))[0].min()
+            for scene, frame in zip(scenes, joints, strict=True)
+        ]
+    )
+
+
+@pytest.mark.parametrize("way", [-1, 1])
+def test_an_open_hand_sweeps_a_body_out_of_its_way(cameras, way):
+    # The fingertips, 45 mm beyond the pinch point, cross the box.
+    keys = [(way * -0.15, 0.205, 0.035, 0.1), (way * 0.02, 0.205, 0.035, 0.1)]
+    action = drive(cameras, *keys, kind="human", frames=16)
+    scenes, world = world_of(BOX).move(action)
+    assert way * place_of(world)[0] > 0.03
+    assert depth_in_flesh(scenes, action.joints_m, "human").max() < 1e-3
+
+
+@pytest.mark.parametrize("kind", ["robot", "human"])
+def test_an_open_hand_that_reaches_around_a_body_moves_nothing(cameras, kind):
+    closure = OPENED if kind == "robot" else 0.1
+    keys = [(0, 0.17, 0.15, closure), (0, 0.25, 0.045, closure), (0, 0.17, 0.15, closure)]
+    _, world = world_of(BOX).move(drive(cameras, *keys, kind=kind))
+    np.testing.assert_array_equal(place_of(world), [0, 0.25, 0])
+
+
+def test_a_jaw_pushes_with_its_middle(cameras):
+    level = (CLOSED, 0.0, 0.0)  # horizontal: the tips are beyond the box, the palm before it
+    keys = [(-0.1, 0.292, 0.04, *level), (0.03, 0.292, 0.04, *level)]
+    _, world = world_of(BOX).move(drive(cameras, *keys))
+    assert place_of(world)[0] > 0.06
+
+
+def test_a_point_above_or_below_a_body_does_not_push_it():
+    ball = {"shape": "ball", "color": "red", "place_m": (0.0, 0.25), "width_m": 0.07}
+    scene = world_of(ball).scene
+    for height in (0.075, 0.069, 0.001):
+        after, presses = push_out(scene, "red ball", np.array([[1e-12, 0.25, height]]), 0.008)
+        assert after is scene
+        assert presses.all()
+    # Next to each other, the first push may bring the ball below the second point.
+    points = np.array([[0.03, 0.25, 0.03], [0.035, 0.25, 0.076]])
+    after, _ = push_out(scene, "red ball", points, 0.008)
+    assert np.linalg.norm(place_of(World(scene=after), "red ball") - [0, 0.25, 0]) < 0.05
 
 
 def test_what_stands_on_a_body_is_carried_with_it(cameras):

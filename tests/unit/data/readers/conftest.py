@@ -3,6 +3,7 @@
 import pytest
 
 from egosim_jax.data.importing import import_recordings
+from egosim_jax.data.recorded_files import DESCRIPTION
 from egosim_jax.data.recording import Recording
 from tests.captures import World
 
@@ -21,6 +22,8 @@ def imported(tmp_path):
         outcomes = list(outcomes)
         assert len(outcomes) == total
         problems = {o.recording_id: o.problem for o in outcomes if o.problem}
+        folders = [path for path in (tmp_path / "out").iterdir() if path.is_dir()]
+        assert all((path / DESCRIPTION).exists() for path in folders), "a part of a recording"
         done = {
             o.recording_id: Recording.load(tmp_path / "out" / o.recording_id)
             for o in outcomes

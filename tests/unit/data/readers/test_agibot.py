@@ -177,14 +177,14 @@ def test_damaged_episodes_are_named(world, tmp_path, imported, caplog):
     base = tmp_path / "set/parameters/327"
     extrinsics = "parameters/camera/head_extrinsic_params_aligned.json"
     entries = json.loads((base / "0" / extrinsics).read_text())
-    (base / "0" / extrinsics).write_text(json.dumps(entries[:5]))
+    (base / "0" / extrinsics).write_text(json.dumps(entries[:11]))
     (base / "1" / extrinsics).write_text(json.dumps([{"extrinsic": 3}] * 12))
     (base / "2/parameters/camera/head_intrinsic_params.json").write_text(
         '{"intrinsic": {"fx": 1e9}}'
     )
     done, problems = imported(AgiBot(source=tmp_path / "set"))
     assert list(done) == ["327_0_000", "327_3_000"]
-    assert done["327_0_000"].frames == 5
-    assert "12 frames and 5 rows (poses 5 and states 12)" in caplog.text
+    assert done["327_0_000"].frames == 11
+    assert "12 frames and 11 camera poses: the first 11" in caplog.text
     assert "rotation_matrix" in problems["327_1_000"]
     assert "fx" in problems["327_2_000"]

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from egosim_jax.data.readers.egodex import JOINT_NAMES, SIDES, EgoDex
-from egosim_jax.geometry import invert, project, transform
 from tests.captures import World
 
 METACARPALS = [f"{f}FingerMetacarpal" for f in ("Index", "Middle", "Ring", "Little")]
@@ -81,15 +80,6 @@ def test_cameras_hands_and_texts_are_read(world, tmp_path, imported):
     assert recording.names == ("towel", "table")
 
 
-def test_joints_project_into_the_image_without_flipping_an_axis(world, tmp_path, imported):
-    write_episode(world, tmp_path / "0.hdf5")
-    recording = imported(EgoDex(source=tmp_path / "0.hdf5"))[0]["0"]
-    local = transform(invert(recording.world_from_camera[:, None]), recording.joints_m)
-    u, v = project(recording.intrinsics_px, local)
-    assert (local[..., 2] > 0).all()
-    assert ((u > 0) & (u < world.width) & (v > 0) & (v < world.height)).all()
-
-
 def test_one_way_tasks_take_the_first_description(world, tmp_path, imported):
     attributes = {"llm_description": "Cut it.", "llm_description2": "?", "llm_type": "static"}
     write_episode(world, tmp_path / "0.hdf5", attributes=attributes)
@@ -112,14 +102,40 @@ def test_a_bad_episode_is_named_and_the_others_are_imported(tmp_path, imported):
     (source / "2.mp4").unlink()
     with h5py.File(source / "3.hdf5", "a") as file:
         file["transforms/camera"][2] = np.nan
-    with h5py.File(source / "4.hdf5", "a") as file:
-        del file["transforms/leftHand"]
     done, problems = imported(EgoDex(source=source))
-    assert list(done) == ["0", "5"]
+    assert list(done) == ["0", "4", "5"]
     assert "not a readable HDF5 file" in problems["1"]
     assert "2.mp4 cannot be read" in problems["2"]
     assert "frame 2 is not a rigid" in problems["3"]
-    assert "leftHand is missing" in problems["4"]
+
+
+EMPTY = {"intrinsics": "camera/intrinsic", "left": "transforms/leftHand",
+         "right": "transforms/rightRingFingerTip", "no hand": "confidences/rightHand"}  # fmt: skip
+
+
+@pytest.mark.parametrize("kept", [None, 0, 5])
+@pytest.mark.parametrize("part", EMPTY)
+def test_a_part_that_is_missing_or_empty_is_unknown_and_the_rest_is_read(
+    world, tmp_path, imported, caplog, part, kept
+):
+    name = EMPTY[part]
+    with h5py.File(copy_episode(tmp_path / "0.hdf5"), "a") as file:
+        values = file[name][:kept]
+        del file[name]
+        if kept is not None:
+            file[name] = values if part != "intrinsics" else values[:0]
+    recording = imported(EgoDex(source=tmp_path))[0]["0"]
+    assert (recording.intrinsics_px is None) == (part == "intrinsics")
+    given = np.isfinite(recording.joints_m).all(axis=(0, 2, 3))
+    assert given.tolist() == [part != "left", part != "right"]
+    np.testing.assert_allclose(recording.world_from_camera, world.poses, atol=1e-6)
+    assert (f"{name}: missing" in caplog.text) == (part != "no hand")
+
+
+def test_intrinsics_of_zeros_are_unknown(tmp_path, imported):
+    with h5py.File(copy_episode(tmp_path / "0.hdf5"), "a") as file:
+        file["camera/intrinsic"][...] = 0
+    assert imported(EgoDex(source=tmp_path))[0]["0"].intrinsics_px is None
 
 
 def replace(path, name, make):

@@ -1,4 +1,4 @@
-"""Clips of EgoSim's data preparation, and TRUMANS, which is refused."""
+"""Clips of EgoSim's data preparation."""
 
 import json
 
@@ -7,9 +7,8 @@ import pytest
 
 from egosim_jax.data.readers.egosim import EgoSimClips
 from egosim_jax.data.readers.hamer import place_hand
-from egosim_jax.data.readers.trumans import Trumans
 from egosim_jax.geometry import invert, transform
-from egosim_jax.types import Cameras, InputError
+from egosim_jax.types import Cameras
 
 
 def write_clip(folder, world, *, poses="poses_da3"):
@@ -58,6 +57,17 @@ def test_frames_are_read_until_the_first_one_without_a_pose(
     assert recording.frames == frames
     np.testing.assert_allclose(recording.world_from_camera, world.poses[:frames], atol=1e-6)
     assert "12 frames and 11 extrinsics" in caplog.text
+
+
+@pytest.mark.parametrize("kept", [0, 3])
+def test_frames_without_intrinsics_have_the_ones_of_the_others(world, tmp_path, imported, kept):
+    target = write_clip(tmp_path / "fold_1", world)
+    write_hands(tmp_path / "fold_1", world)
+    for path in sorted(target.glob("intrinsics_*.npy"))[kept:]:
+        path.unlink()
+    recording = imported(EgoSimClips(source=tmp_path / "fold_1"))[0]["fold_1"]
+    np.testing.assert_allclose(recording.world_from_camera, world.poses, atol=1e-6)
+    assert (recording.intrinsics_px is None) == (recording.joints_m is None) == (not kept)
 
 
 def test_poses_of_another_rate_are_refused(world, tmp_path, imported):
@@ -129,8 +139,3 @@ def test_hostile_hands_are_refused(world, tmp_path, imported, changes, message):
     write_clip(tmp_path / "fold_1", world)
     write_hands(tmp_path / "fold_1", world, **changes)
     assert message in imported(EgoSimClips(source=tmp_path / "fold_1"))[1]["fold_1"]
-
-
-def test_trumans_is_refused_with_the_reason(tmp_path):
-    with pytest.raises(InputError, match="SMPL-X"):
-        Trumans(source=tmp_path).find()

@@ -63,17 +63,36 @@ def test_poses_that_do_not_fit_the_video_stay_unknown(plane, tmp_path, imported)
     assert recording.intrinsics_px is not None
 
 
-def test_of_more_frames_than_poses_those_with_poses_are_used(plane, tmp_path, imported):
-    video_id = write_set(tmp_path / "set", plane, poses=plane.poses[:15])
+@pytest.mark.parametrize("count", [19, 16, 15, 13, 10])
+def test_of_more_frames_than_poses_those_with_poses_are_used(
+    plane, tmp_path, imported, caplog, count
+):
+    video_id = write_set(tmp_path / "set", plane, poses=plane.poses[:count])
     recording = imported(EgoVid(source=tmp_path / "set"))[0][video_id]
-    np.testing.assert_allclose(recording.world_from_camera, plane.poses[:15], atol=1e-9)
+    np.testing.assert_allclose(recording.world_from_camera, plane.poses[:count], atol=1e-9)
+    assert recording.frames == count
+    assert f"the first {count} of both are used" in caplog.text
 
 
-def test_poses_of_another_rate_stay_unknown(plane, tmp_path, imported):
-    video_id = write_set(tmp_path / "set", plane, poses=plane.poses[:10])
+@pytest.mark.parametrize("count", [16, 15, 13, 10, 30])
+def test_poses_of_another_rate_stay_unknown(plane, tmp_path, imported, caplog, count):
+    poses = plane.poses[np.arange(count) * 20 // count]
+    video_id = write_set(tmp_path / "set", plane, poses=poses)
     recording = imported(EgoVid(source=tmp_path / "set"))[0][video_id]
-    assert recording.world_from_camera is None
-    assert recording.provenance["poses"] == "unknown: 10 poses for 20 frames"
+    assert (recording.world_from_camera, recording.frames) == (None, 20)
+    assert recording.provenance["poses"] == "unknown: at another rate they fit the video better"
+    assert f"{count} poses for 20 frames stay unknown" in caplog.text
+    assert "are used" not in caplog.text
+
+
+@pytest.mark.parametrize("damage", ["missing", "empty"])
+def test_poses_without_intrinsics_stay_unknown(plane, tmp_path, imported, damage):
+    video_id = write_set(tmp_path / "set", plane)
+    path = tmp_path / f"set/poses/{video_id}/intri.npy"
+    path.unlink() if damage == "missing" else np.save(path, np.zeros((0, 3)))
+    recording = imported(EgoVid(source=tmp_path / "set"))[0][video_id]
+    assert (recording.world_from_camera, recording.frames) == (None, 20)
+    assert recording.names == ("onion", "knife")
 
 
 def test_a_span_of_a_long_video_is_taken(world, tmp_path, imported):

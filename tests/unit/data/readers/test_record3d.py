@@ -3,29 +3,18 @@
 import io
 import json
 import struct
-import sys
-import types
 import zipfile
-import zlib
 
+import lzfse
 import numpy as np
 import pytest
 from PIL import Image
 
 from egosim_jax.data.readers import record3d
-from egosim_jax.data.readers.lzfse import unpacked_size
 from egosim_jax.data.readers.record3d import Record3D
 from egosim_jax.types import InputError
 from tests.captures import quaternions
 
-ZEROS = (
-    "6276783200c0000004000000001600700000000000280040820000003b0c800f2f42290000004001000000e04b"
-    "786e8e000000000000000000000000000000e0d107000000000000000000000000000000000000000000000000"
-    "000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000"
-    "0000000078f6ffffffffffffffffffffffffffffffffffffffffffffffffefffe8ff0262767824"
-)
-STORED = "6276782d10000000000102030405060708090a0b0c0d0e0f62767824"
-"""Streams of the reference implementation, in hexadecimal."""
 FLIP = np.diag([1.0, -1, -1, 1])
 
 
@@ -33,12 +22,6 @@ def jpeg(frame):
     data = io.BytesIO()
     Image.fromarray(frame).save(data, "JPEG", quality=95)
     return data.getvalue()
-
-
-def pack(data):
-    """One LZFSE block with zlib's payload: only the substitute below decompresses it."""
-    payload = zlib.compress(data)
-    return b"bvxn" + struct.pack("<II", len(data), len(payload)) + payload + b"bvx$"
 
 
 def write_capture(path, world, *, per_frame=True, images="rgbd", **changes):
@@ -62,29 +45,13 @@ def write_capture(path, world, *, per_frame=True, images="rgbd", **changes):
             archive.writestr(f"{images}/{number}.jpg", jpeg(frame))
             depth = np.full((3, 4), 0.5 + 0.1 * number, np.float32)
             depth[0, 0] = np.nan
-            archive.writestr(f"rgbd/{number}.depth", pack(depth.tobytes()))
+            archive.writestr(f"rgbd/{number}.depth", lzfse.compress(depth.tobytes()))
 
 
-@pytest.fixture
-def unpacker(monkeypatch):
-    """A substitute for the optional library that compresses with zlib."""
-    module = types.ModuleType("liblzfse")
-    module.decompress, module.error = lambda data: zlib.decompress(data[12:-4]), zlib.error
-    module.__spec__ = types.SimpleNamespace(name="liblzfse")
-    monkeypatch.setitem(sys.modules, "liblzfse", module)
-
-
-@pytest.mark.parametrize("per_frame", [True, False])
-def test_poses_and_intrinsics_are_those_of_the_scene(world, tmp_path, imported, per_frame):
-    write_capture(tmp_path / "scan.r3d", world, per_frame=per_frame)
-    done, problems = imported(Record3D(source=tmp_path))
-    assert not problems
-    recording = done["scan"]
-    np.testing.assert_allclose(recording.world_from_camera, world.poses, atol=1e-9)
+def test_one_matrix_of_intrinsics_serves_all_frames(world, tmp_path, imported):
+    write_capture(tmp_path / "scan.r3d", world, per_frame=False)
+    recording = imported(Record3D(source=tmp_path))[0]["scan"]
     np.testing.assert_allclose(recording.intrinsics_px, world.intrinsics, atol=1e-9)
-    assert recording.metric
-    assert recording.fps == 60
-    world.assert_first(recording)
 
 
 TIMES = 10.0 + np.arange(12) / 30
@@ -126,7 +93,7 @@ def test_time_stamps_of_too_many_frames_or_with_a_pause_are_refused(
     assert "more than 100, the maximum. Split the capture." in problems["many"]
 
 
-def test_depth_is_in_meters_and_unknown_where_it_is_not_finite(world, tmp_path, imported, unpacker):
+def test_depth_is_in_meters_and_unknown_where_it_is_not_finite(world, tmp_path, imported):
     write_capture(tmp_path / "scan.r3d", world)
     recording = imported(Record3D(source=tmp_path / "scan.r3d"))[0]["scan"]
     depth = recording.read_depth(3)
@@ -135,18 +102,39 @@ def test_depth_is_in_meters_and_unknown_where_it_is_not_finite(world, tmp_path, 
     assert np.isinf(depth[0, 0])
 
 
+def test_depth_of_low_or_unknown_confidence_is_unknown(world, tmp_path, imported):
+    write_capture(tmp_path / "scan.r3d", world)
+    with zipfile.ZipFile(tmp_path / "scan.r3d", "a") as archive:
+        levels = np.tile(np.array([0, 0, 1, 2], np.uint8), (3, 1))
+        for number in range(11):
+            archive.writestr(f"rgbd/{number}.conf", lzfse.compress(levels.tobytes()))
+    recording = imported(Record3D(source=tmp_path))[0]["scan"]
+    depth = recording.read_depth(3)[-1]
+    assert np.isinf(depth[: world.width // 2]).all()
+    np.testing.assert_allclose(depth[world.width // 2 :], 0.8)
+    assert recording.read_depth(11) is None
+
+
+def test_without_a_matrix_intrinsics_are_unknown(world, tmp_path, imported):
+    write_capture(tmp_path / "scan.r3d", world, per_frame=False, K=[])
+    recording = imported(Record3D(source=tmp_path))[0]["scan"]
+    assert recording.intrinsics_px is None
+    np.testing.assert_allclose(recording.world_from_camera, world.poses, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (pack(bytes(48))[:9], "cut off"),
-        (b"bvxn" + struct.pack("<II", 1 << 31, 0) + pack(bytes(48)), "2,147,483,696 bytes"),
+        (lzfse.compress(bytes(48))[:9], "cut off"),
+        (
+            b"bvxn" + struct.pack("<II", 1 << 31, 0) + lzfse.compress(bytes(48)),
+            "2,147,483,696 bytes",
+        ),
         (b"nothing" * 3, "not an LZFSE stream"),
         (b"bvxn" + struct.pack("<II", 48, 5) + b"wrong" + b"bvx$", "damaged"),
     ],
 )
-def test_depth_that_is_not_what_it_should_be_is_refused(
-    world, tmp_path, imported, unpacker, data, message
-):
+def test_depth_that_is_not_what_it_should_be_is_refused(world, tmp_path, imported, data, message):
     write_capture(tmp_path / "scan.r3d", world)
     with zipfile.ZipFile(tmp_path / "scan.r3d") as archive:
         archive.extractall(tmp_path / "room")
@@ -155,20 +143,21 @@ def test_depth_that_is_not_what_it_should_be_is_refused(
     assert message in problem
 
 
-def test_the_size_of_streams_of_the_reference_implementation_is_known():
-    """Compressed by Apple's library: 49,152 zeros, and 16 incompressible bytes."""
-    zeros = bytes.fromhex(ZEROS)
-    assert unpacked_size(zeros) == 49_152
-    stored = bytes.fromhex(STORED)
-    assert unpacked_size(stored) == 16
-
-
-def test_without_the_library_depth_is_unknown_and_that_is_recorded(world, tmp_path, imported):
+def test_without_the_library_depth_is_unknown_and_that_is_recorded(
+    world, tmp_path, imported, monkeypatch
+):
     write_capture(tmp_path / "scan.r3d", world)
+    monkeypatch.setattr(record3d, "find_spec", lambda name: None)
     recording = imported(Record3D(source=tmp_path))[0]["scan"]
-    if "liblzfse" not in sys.modules:
-        assert recording.depth is None
-        assert "pyliblzfse" in recording.provenance["depth"]
+    assert recording.depth is None
+    assert "pip install" in recording.provenance["depth"]
+
+
+@pytest.mark.parametrize("data", [bytes(300_000), bytes(range(64)) * 999, b"short"])
+def test_the_size_of_a_stream_is_known_before_it_is_unpacked(data):
+    packed = lzfse.compress(data)
+    assert record3d.unpacked_size(packed) == len(data)
+    assert record3d.unpack_lzfse(packed, len(data)) == data
 
 
 def test_a_folder_that_was_exported_is_read(world, tmp_path, imported):

@@ -1,16 +1,13 @@
 """Texts with carriage returns, byte order marks, tabs and blanks read as the plain ones."""
 
-import json
-
 import numpy as np
 import pytest
 
 from egosim_jax.data.metadata import read_metadata
 from egosim_jax.data.readers.colmap import Colmap
 from egosim_jax.data.readers.egovid import _rows
-from egosim_jax.data.readers.nerfstudio import Nerfstudio
 from egosim_jax.data.readers.taste_rob import read_table
-from tests.unit.data.readers import test_colmap, test_nerfstudio
+from tests.unit.data.readers import test_colmap
 
 BOM = b"\xef\xbb\xbf"
 VARIANTS = {
@@ -34,16 +31,6 @@ def test_a_colmap_model(world, tmp_path, imported, variant):
     assert len(recording.points.frames) == world.frames * len(test_colmap.POINTS)
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_a_nerfstudio_capture(world, tmp_path, imported, variant):
-    test_nerfstudio.write_capture(tmp_path / "desk", world)
-    path = tmp_path / "desk/transforms.json"
-    text = json.dumps(json.loads(path.read_text()), indent=1) + "\n"
-    path.write_bytes(VARIANTS[variant](text.encode()))
-    recording = imported(Nerfstudio(source=tmp_path / "desk", fps=10.0))[0]["desk"]
-    np.testing.assert_allclose(recording.world_from_camera, world.poses, atol=1e-12)
-
-
 TABLE = b"ego_prior_video,prompt,video_id\na/p.mp4,Pick the cup,a\nb/p.mp4,Place it,b\n"
 LINES = (
     b'{"ego_prior_video": "a/p.mp4", "prompt": "Pick the cup", "video_id": "a"}\n'
@@ -51,11 +38,14 @@ LINES = (
 )
 
 
-@pytest.mark.parametrize("variant", [*VARIANTS, "spaces"])
-@pytest.mark.parametrize(("name", "data"), [("m.csv", TABLE), ("m.jsonl", LINES)])
+@pytest.mark.parametrize(
+    ("variant", "name", "data"),
+    [
+        *((variant, "m.csv", TABLE) for variant in (*VARIANTS, "spaces")),
+        *((variant, "m.jsonl", LINES) for variant in ("bom_crlf", "trailing_blanks", "spaces")),
+    ],
+)
 def test_metadata(tmp_path, variant, name, data):
-    if (variant, name) == ("cr", "m.jsonl"):
-        pytest.skip("only a line feed ends a JSON line")
     spaces = {"spaces": lambda d: d.replace(b",", b" , ") if name == "m.csv" else d}
     (tmp_path / name).write_bytes((VARIANTS | spaces)[variant](data))
     clips = read_metadata(tmp_path / name)

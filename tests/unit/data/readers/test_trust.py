@@ -1,14 +1,18 @@
 """Unknown facts of a source are unknown in its recording, or the user is asked."""
 
+from fractions import Fraction
+
+import av
 import h5py
 import numpy as np
 import pytest
 
 from egosim_jax.data.readers.agibot import AgiBot
+from egosim_jax.data.readers.egosim import EgoSimClips
 from egosim_jax.data.readers.nerfstudio import Nerfstudio
 from egosim_jax.data.readers.record3d import Record3D
 from egosim_jax.data.readers.taste_rob import TasteRob
-from tests.unit.data.readers import test_agibot, test_nerfstudio, test_record3d
+from tests.unit.data.readers import test_agibot, test_egosim, test_nerfstudio, test_record3d
 
 PLACEHOLDERS = {
     "identity": np.eye(4),
@@ -25,6 +29,16 @@ def nerfstudio(root, world):
 def record3d(root, world):
     test_record3d.write_capture(root.with_suffix(".r3d"), world)
     return Record3D(source=root.with_suffix(".r3d"))
+
+
+def write_agibot(root, world):
+    test_agibot.write_episode(root, world, parts=False)
+    return AgiBot(source=root), next(root.rglob("head_color.mp4"))
+
+
+def write_egosim(root, world):
+    test_egosim.write_clip(root / "fold", world)
+    return EgoSimClips(source=root), root / "fold/video_16fps.mp4"
 
 
 @pytest.mark.parametrize("write", [nerfstudio, record3d])
@@ -51,6 +65,22 @@ def test_a_camera_that_its_dataset_calls_fixed_is_at_rest(world, tmp_path, impor
     (tmp_path / "set/t.csv").write_text("video,caption\na.mp4,Pick the cup\n")
     recording = imported(TasteRob(source=tmp_path / "set"))[0]["a"]
     assert (recording.world_from_camera == np.eye(4)).all()
+
+
+@pytest.mark.parametrize("write", [write_agibot, write_egosim])
+def test_intrinsics_of_pixels_that_are_not_square_are_ambiguous(world, tmp_path, imported, write):
+    reader, video = write(tmp_path / "set", world)
+    with av.open(str(video), "w") as container:
+        stream = container.add_stream("libx264", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 96, world.height, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
+        for frame in world.video:
+            frame = av.VideoFrame.from_ndarray(frame, format="rgb24")
+            container.mux(stream.encode(frame.reformat(96, world.height)))
+        container.mux(stream.encode())
+    done, problems = imported(reader)
+    assert not done
+    assert "setsar=1" in next(iter(problems.values()))
 
 
 def write_openings(root, world, values, command=None):

@@ -24,13 +24,6 @@ def test_a_known_shift_is_found(video):
     assert found.psnr_full == pytest.approx(np.mean(10 * np.log10(255**2 / squared)), abs=1e-4)
 
 
-def test_aligned_videos_gain_nothing(video):
-    noisy = np.clip(video.astype(int) + np.arange(3)[:, None, None, None], 0, 255).astype(np.uint8)
-    found = align(noisy, video, most_px=4)
-    assert found.shift_px == (0, 0)
-    assert found.gain == 0
-
-
 def test_videos_of_other_shapes_are_refused(video):
     with pytest.raises(InputError, match="must be uint8"):
         align(video[:2], video)

@@ -5,7 +5,6 @@ import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from egosim_jax.evaluation.metrics.image import (
-    MAX_PSNR,
     clip_psnr,
     color_drift,
     fit_colors,
@@ -42,15 +41,6 @@ def test_psnr_is_that_of_scikit_image(pair):
     np.testing.assert_allclose(psnr(*pair), expected, rtol=1e-6)
 
 
-def test_psnr_of_an_error_of_one_level_everywhere():
-    video = np.full((2, 16, 16, 3), 100, np.uint8)
-    np.testing.assert_allclose(psnr(video, video + 1), 20 * np.log10(255), rtol=1e-6)
-
-
-def test_psnr_of_equal_frames_is_the_cap(pair):
-    assert (psnr(pair[0], pair[0]) == MAX_PSNR).all()
-
-
 def test_ssim_is_that_of_scikit_image(pair):
     expected = [reference_ssim(a, b) for a, b in zip(*pair, strict=True)]
     # float32 moments of centerd values, against scikit-image's float64.
@@ -61,10 +51,6 @@ def test_ssim_stays_exact_near_white():
     rng = np.random.default_rng(0)
     a, b = (rng.integers(252, 256, (1, 40, 52, 3)).astype(np.uint8) for _ in range(2))
     np.testing.assert_allclose(ssim(a, b), [reference_ssim(a[0], b[0])], atol=1e-6)
-
-
-def test_ssim_of_equal_frames_is_one(pair):
-    np.testing.assert_allclose(ssim(pair[0], pair[0]), 1, atol=1e-6)
 
 
 def test_the_color_fit_undoes_an_affine_change(pair):

@@ -24,12 +24,6 @@ def test_mmrv_equals_its_definition(seed):
     assert mmrv(s, r) == pytest.approx(np.mean(violations))
 
 
-def test_mmrv_is_zero_for_equal_rankings_and_large_for_reversed_ones():
-    reference = np.array([0.1, 0.5, 0.9])
-    assert mmrv(np.array([0.4, 0.45, 0.5]), reference) == 0
-    assert mmrv(np.array([0.5, 0.45, 0.4]), reference) == pytest.approx((0.8 + 0.4 + 0.8) / 3)
-
-
 def test_constant_success_has_no_correlation():
     assert np.isnan(pearson(np.ones(4), np.arange(4.0)))
     assert np.isnan(pearson(np.full(7, 0.1), np.arange(7.0)))  # whose mean is not exactly 0.1
@@ -37,33 +31,9 @@ def test_constant_success_has_no_correlation():
     assert np.isnan(spearman(np.ones(4), np.arange(4.0)))
 
 
-def test_intervals_contain_the_value_and_shrink_with_scenes():
-    rng = np.random.default_rng(0)
-    chance = np.linspace(0.05, 0.95, 8)[:, None]
-
-    def found(scenes):
-        true = (rng.random((8, scenes)) < chance).astype(float)
-        generated = np.where(rng.random((8, scenes)) < 0.8, true, 1 - true)
-        return agreement(generated, true, resamples=300)
-
-    few, many = found(12), found(200)
-    for result in (few, many):
-        value = result["pearson"]
-        assert value["low"] <= value["mean"] <= value["high"]
-        assert result["spearman"].keys() == {"mean"}  # no interval
-    gap = {name: value["high"] - value["low"] for name, value in few.items() if "low" in value}
-    assert many["pearson"]["high"] - many["pearson"]["low"] < gap["pearson"]
-
-
-def test_perfect_agreement_is_one_and_zero():
-    true = (np.random.default_rng(0).random((8, 24)) < np.linspace(0, 1, 8)[:, None]).astype(float)
-    result = agreement(true, true, resamples=100)
-    assert result["pearson"]["mean"] == result["spearman"]["mean"] == pytest.approx(1)
-    assert result["mmrv"] == {"mean": 0, "low": 0, "high": 0}
-
-
-@pytest.mark.parametrize(("policies", "scenes"), [(8, 12), (8, 24), (5, 48)])
-@pytest.mark.parametrize("case", ["far apart", "alike", "one noise"])
+@pytest.mark.parametrize(
+    ("policies", "scenes", "case"), [(8, 12, "far apart"), (8, 24, "alike"), (5, 48, "one noise")]
+)
 def test_intervals_have_the_value_over_all_scenes_as_often_as_they_say(policies, scenes, case):
     rng = np.random.default_rng(policies * scenes)
     wobble = np.sin(3 * np.arange(policies))

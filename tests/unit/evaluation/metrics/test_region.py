@@ -6,11 +6,13 @@ from scipy import ndimage
 
 from egosim_jax.evaluation.metrics.region import (
     centroid_errors,
+    held_and_released,
     label,
     lost_share,
     open_mask,
-    region_psnr,
+    right_share,
     silhouette_iou,
+    squared_error,
 )
 from egosim_jax.types import VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence
@@ -38,17 +40,6 @@ def test_a_pixel_has_the_label_of_the_nearest_color_under_some_light():
         assert got[0, row, column] == min(distances, key=distances.get)
 
 
-def test_psnr_counts_the_pixels_of_the_region_alone():
-    rng = np.random.default_rng(0)
-    a, b = rng.integers(0, 256, (2, 3, 32, 48, 3), dtype=np.uint8)
-    region = discs((10, 10), (12, 12), (14, 14))
-    pairs = zip(a[region].ravel().tolist(), b[region].ravel().tolist(), strict=True)
-    error = np.mean([(x - y) ** 2 for x, y in pairs])
-    assert region_psnr(a, b, region) == pytest.approx(10 * np.log10(255**2 / error))
-    assert region_psnr(a, a, region) == 100
-    assert np.isnan(region_psnr(a, b, np.zeros_like(region)))
-
-
 def test_iou_of_silhouettes_over_the_frames_that_have_one():
     truth = discs((10, 10), (10, 10))
     found = np.stack([truth[0], discs((40, 90))[0]])
@@ -56,16 +47,6 @@ def test_iou_of_silhouettes_over_the_frames_that_have_one():
     truth[1] = False
     assert silhouette_iou(found, truth) == 1
     assert np.isnan(silhouette_iou(found, np.zeros_like(truth)))
-
-
-def test_opening_removes_lines_and_specks_and_keeps_squares_and_the_border():
-    mask = np.zeros((1, 12, 16), bool)
-    mask[0, 3:6, 4:7] = True
-    mask[0, 8:10, :] = True
-    mask[0, :2, 12:] = True
-    kept = np.zeros_like(mask)
-    kept[0, 3:6, 4:7] = kept[0, :2, 12:] = True
-    np.testing.assert_array_equal(open_mask(mask), kept)
 
 
 @pytest.mark.parametrize("density", [0.4, 0.7, 0.95])
@@ -104,3 +85,22 @@ def test_the_metrics_find_hands_and_objects_in_the_ground_truth(kind, least):
         seen = label(clip.frames, bare.frames, movers)
         assert silhouette_iou(open_mask(seen >= FIRST_HAND), clip.ids >= FIRST_HAND) > least
         assert centroid_errors(seen == target, clip.ids == target).max() < 2
+
+
+def test_pixels_within_30_levels_are_right_and_all_count_in_the_error():
+    target = np.full((2, 4, 4, 3), 100, np.uint8)
+    video, region = target.copy(), np.zeros((2, 4, 4), bool)
+    region[0, 0] = True
+    video[0, 0] = [[130, 100, 100], [131, 100, 100], [100, 69, 100], [100, 100, 100]]
+    video[1] = 0  # outside of the region
+    assert right_share(video, target, region) == 0.5
+    assert squared_error(video, target, region) == pytest.approx((30**2 + 2 * 31**2) / 12)
+    assert np.isnan(right_share(video, target, region & False))
+
+
+def test_an_object_moves_in_some_frames_and_then_rests():
+    path = np.repeat(np.eye(4)[None], 6, axis=0)
+    path[2:, 0, 3], path[4:, 1, 3] = 0.05, 0.002
+    moving, after = held_and_released(path)
+    assert moving.tolist() == [False, False, True, False, True, False]
+    assert after.tolist() == [False, False, False, False, False, True]

@@ -20,21 +20,47 @@ def make(count, **options):
     return WorldVectorEnv(painted(), count, **options) if count else WorldEnv(painted(), **options)
 
 
-def rows(env, count):
+def rows(count):
     return np.tile(REST, (count, 1, 1) if count else (1, 1))
 
 
-@pytest.mark.parametrize("count", [0, 2], ids=["single", "vector"])
-@pytest.mark.parametrize("seed", [-1, 1 << 63, np.int64(-3), np.array(-1)], ids=repr)
-def test_a_seed_out_of_bounds_is_refused(count, seed):
-    with pytest.raises(InputError, match=r"from 0 to 2\*\*63 - 1"):
-        make(count).reset(seed=seed)
+SINGLE, VECTOR = 0, 2
 
 
-@pytest.mark.parametrize("seed", [1.5, "3", np.float64(3), np.array([3, 4]), [3], b"3"], ids=repr)
-def test_a_seed_that_is_no_whole_number_is_refused(seed):
-    with pytest.raises(InputError, match="must be a whole number"):
-        seed_of(seed)
+@pytest.mark.parametrize(
+    ("count", "call", "message"),
+    [
+        (SINGLE, lambda env: env.reset(seed=-1), r"from 0 to 2\*\*63 - 1"),
+        (VECTOR, lambda env: env.reset(seed=np.array(1 << 63)), r"from 0 to 2\*\*63 - 1"),
+        (SINGLE, lambda env: env.step(REST[:6]), "The action has shape"),
+        (VECTOR, lambda env: env.step(np.stack([REST, REST + 9])), "of the actions has"),
+        (SINGLE, lambda env: env.step(REST + np.nan), "of the actions has"),
+        (VECTOR, lambda env: env.step(REST[None]), "1 actions for 2 episodes: give one for each"),
+        (VECTOR, lambda env: env.chunk_step(np.zeros((3, 1, 7))), "3 actions for 2 episodes"),
+        (VECTOR, lambda env: env.chunk_step(rows(2), prompts="ab"), "one for each of 2 episodes"),
+        (VECTOR, lambda env: env.chunk_step(rows(2), prompts=["a"]), "one for each of 2 episodes"),
+    ],
+)
+def test_a_wrong_call_is_refused_and_changes_nothing(count, call, message):
+    env = make(count)
+    env.reset(seed=3)
+    with pytest.raises(InputError, match=message):
+        call(env)
+    env.chunk_step(rows(count))
+
+
+@pytest.mark.parametrize(
+    ("convert", "value", "message"),
+    [
+        (seed_of, 1.5, "must be a whole number"),
+        (seed_of, np.array([3, 4]), "must be a whole number"),
+        (to_options, "state", "must be a map"),
+        (to_options, {3: 4}, "must be a map"),
+    ],
+)
+def test_a_seed_or_options_of_another_type_are_refused(convert, value, message):
+    with pytest.raises(InputError, match=message):
+        convert(value)
 
 
 @pytest.mark.parametrize("seed", [np.array([3, 4]), (3, np.int64(4)), [3, 4]], ids=type)
@@ -44,25 +70,19 @@ def test_seeds_of_a_vector_environment_may_be_any_sequence(seed):
     assert [running.start.seed for running in env.running] == [3, 4]
 
 
-def test_a_seed_of_numpy_is_taken_by_a_single_environment():
-    env = make(0)
-    env.reset(seed=np.int64(3))
-    assert env.running.start.seed == 3
-
-
 @pytest.mark.parametrize("count", [0, 2], ids=["single", "vector"])
 def test_an_ended_episode_takes_no_step_until_it_is_reset(count):
     env = make(count, max_chunks=1)
     env.reset(seed=3)
-    assert np.all(env.chunk_step(rows(env, count))[3])
+    assert np.all(env.chunk_step(rows(count))[3])
     for step, action in (
-        (env.chunk_step, rows(env, count)),
-        (env.step, rows(env, count)[..., 0, :]),
+        (env.chunk_step, rows(count)),
+        (env.step, rows(count)[..., 0, :]),
     ):
         with pytest.raises(InputError, match="has ended: reset it"):
             step(action)
     env.reset(seed=3)
-    env.chunk_step(rows(env, count))
+    env.chunk_step(rows(count))
 
 
 @pytest.mark.parametrize("count", [0, 2], ids=["single", "vector"])
@@ -73,44 +93,12 @@ def test_a_closed_environment_refuses_every_call(count):
     env.close()
     calls = [
         lambda: env.reset(seed=3),
-        lambda: env.chunk_step(rows(env, count)),
-        lambda: env.step(rows(env, count)[..., 0, :]),
+        lambda: env.chunk_step(rows(count)),
+        lambda: env.step(rows(count)[..., 0, :]),
     ]
     for call in calls:
         with pytest.raises(InputError, match="is closed: make a new one"):
             call()
-
-
-@pytest.mark.parametrize("given", [0, 1, 3])
-def test_a_vector_environment_needs_an_action_for_each_episode(given):
-    env = make(2)
-    env.reset(seed=3)
-    for step, action in ((env.step, REST), (env.chunk_step, REST[None])):
-        with pytest.raises(InputError, match=f"{given} actions for 2 episodes: give one for each"):
-            step(np.tile(action, (given, *[1] * action.ndim)))
-
-
-@pytest.mark.parametrize("count", [0, 2], ids=["single", "vector"])
-@pytest.mark.parametrize("row", [REST[:6], np.append(REST, 0), REST + 9, REST + np.nan], ids=len)
-def test_a_row_that_is_no_row_is_refused(count, row):
-    env = make(count)
-    env.reset(seed=3)
-    with pytest.raises(InputError, match=r"The action has shape|of the actions has"):
-        env.step(np.stack([row] * count) if count else row)
-
-
-@pytest.mark.parametrize("prompts", ["ab", ["a"], ["a"] * 3, []], ids=str)
-def test_a_vector_environment_needs_a_prompt_for_each_episode(prompts):
-    env = make(2)
-    env.reset(seed=3)
-    with pytest.raises(InputError, match="one for each of 2 episodes"):
-        env.chunk_step(rows(env, 2), prompts=prompts)
-
-
-@pytest.mark.parametrize("options", ["state", 3, {3: 4}, [("prompt", "a")]], ids=str)
-def test_options_that_are_no_map_are_refused(options):
-    with pytest.raises(InputError, match="must be a map"):
-        to_options(options)
 
 
 @pytest.mark.parametrize("count", [0, 2], ids=["single", "vector"])
@@ -136,9 +124,6 @@ def test_a_reward_that_cannot_judge_the_episode_is_refused_at_its_reset(count, r
     ("fields", "message"),
     [
         ({"number": "10"}, "must be an id, a whole number"),
-        ({"number": 10.0}, "must be an id, a whole number"),
-        ({"number": True}, "must be an id, a whole number"),
-        ({"offset_m": (0.1, 0.0)}, "must be x, y and z in meters"),
         ({"offset_m": (0.1, 0.0, np.nan)}, "must be x, y and z in meters"),
         ({"tolerance_m": 0.0}, "must be above 0"),
     ],
@@ -147,12 +132,6 @@ def test_a_reward_that_cannot_judge_the_episode_is_refused_at_its_reset(count, r
 def test_a_task_that_no_episode_can_have_is_refused_at_once(fields, message):
     with pytest.raises(InputError, match=message):
         MoveObject(**{"number": 10, "offset_m": (0.1, 0.0, 0.0), **fields})
-
-
-def test_the_advice_about_an_unknown_object_works():
-    numbers = make(0).reset(seed=3)[1]["objects"]
-    for number in numbers:
-        make(0, reward=MoveObject(number=number, offset_m=(0.1, 0.0, 0.0))).reset(seed=3)
 
 
 @pytest.mark.parametrize("vector", [False, True], ids=["single", "vector"])
@@ -169,8 +148,6 @@ def test_an_unknown_option_is_refused_before_a_world_is_loaded(vector, capsys):
     ("options", "message"),
     [
         ({"max_chunks": 0}, "max_chunks is 0: it must be a whole number of at least 1"),
-        ({"max_chunks": -1}, "max_chunks is -1"),
-        ({"max_chunks": "a"}, "max_chunks is 'a'"),
         ({"max_chunks": True}, "max_chunks is True"),
         ({"observe": "depth"}, "observe is the text 'depth': give a tuple"),
         ({"actions": "wrist"}, r"actions is 'wrist': .*ActionSpec\(layout='wrist'\)"),
@@ -196,4 +173,4 @@ def test_a_reward_that_is_no_reward_is_named(count):
     env = make(count, reward=lambda outcome: 0.5)
     env.reset(seed=3)
     with pytest.raises(InputError, match=r"The reward function returned 0\.5"):
-        env.chunk_step(rows(env, count))
+        env.chunk_step(rows(count))

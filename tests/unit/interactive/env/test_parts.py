@@ -1,12 +1,14 @@
 """Rows that are given part by part, while a clip is made."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from egosim_jax.interactive.env.parts import part_rows
 from egosim_jax.interactive.env.single import WorldEnv
+from egosim_jax.simulation.simulator import Simulator
 from egosim_jax.types import InputError
 from tests.painted import VIDEO, ChunkPainter, PaintedWorld
 
@@ -52,17 +54,6 @@ def test_equal_rows_in_parts_and_at_once_give_equal_steps(env):
     assert 0 < info["timing"].first_frame_s <= info["timing"].last_frame_s
 
 
-def test_the_hand_changes_course_within_a_clip(env):
-    rows = ahead(env)
-    first = env.part_step(rows[:2])[0]["frames"]
-    turned = env.part_step(rows[1::-1])[0]["frames"]
-    straight = WorldEnv(WORLD)
-    straight.reset(seed=3)
-    frames = straight.chunk_step(rows)[0]["frames"]
-    np.testing.assert_array_equal(turned[:3], first[:3])
-    assert not np.array_equal(turned[3:], frames[3:])
-
-
 def test_a_short_part_is_padded_and_a_long_one_refused(env):
     with pytest.raises(InputError, match=r"must have 1 to 2 rows of 7 numbers"):
         env.part_step(ahead(env)[:3])
@@ -71,21 +62,19 @@ def test_a_short_part_is_padded_and_a_long_one_refused(env):
     assert env.part_step(ahead(env)[:1])[-1]["chunk"] == 1
 
 
-def test_a_reset_begins_with_the_first_part(env):
-    env.part_step(ahead(env)[:2])
-    env.reset(seed=3)
-    assert env.part_step(ahead(env)[:2])[-1]["part"] == 1
-
-
 def test_a_state_that_is_updated_by_chunk_sees_each_chunk_from_the_last_frame_on(env, monkeypatch):
     seen = []
 
-    def update(self, state, clip, action):
+    def perceive(self, clip, action, state):
         seen.append((len(clip.frames), len(action.joints_m), state.step))
-        return replace(state, step=state.step + 1), (f"note {state.step}",)
+        return SimpleNamespace(notes=(f"note {state.step}",))
 
-    world = replace(WORLD, update_every="chunk")
-    monkeypatch.setattr(type(world.simulator(world.start(3, env.actions))), "update", update)
+    def fuse(self, state, perceived):
+        return replace(state, step=state.step + 1)
+
+    world = replace(WORLD, update_every="chunk", perception="classical")
+    monkeypatch.setattr(Simulator, "perceive", perceive)
+    monkeypatch.setattr(Simulator, "fuse", fuse)
     by_chunk = WorldEnv(world)
     by_chunk.reset(seed=3)
     info = by_chunk.chunk_step(ahead(env))[-1]

@@ -65,11 +65,6 @@ def measured(frames, after=None, acted=None):
     return validity(state, step, acted or action(), reference)
 
 
-def test_frames_of_the_state_agree_with_it():
-    agree = {"validity": 1.0, "object_validity": 1.0, "least_valid_object": CONE}
-    assert measured(view().frames) == agree
-
-
 def test_a_faded_object_lowers_only_the_figure_of_objects():
     faded = view().frames.copy()
     faded[2:][view().object_ids[2:] == CONE] = 110
@@ -102,13 +97,6 @@ def test_a_touched_object_may_look_as_it_will():
     held = action(place=(-0.15, 0.06, 0.5)).joints_m
     assert untouched(scene(), scene(), held) == [CUP]
     assert untouched(scene(), scene(), np.full_like(held, np.nan)) == [CONE, CUP]
-
-
-def test_without_untouched_objects_there_is_no_figure():
-    pose = np.eye(4)
-    pose[0, 3] = 0.05
-    moved = replace(scene(), world_from_object={CONE: pose, CUP: pose})
-    assert "object_validity" not in measured(view().frames, after=moved)
 
 
 def test_poses_are_at_the_objects_and_turn_with_them():

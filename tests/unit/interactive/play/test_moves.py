@@ -14,10 +14,10 @@ from egosim_jax.interactive.play.moves import (
     perform,
     pre_grasp_pose,
     scene_from_state,
+    suggest_goal,
 )
 from egosim_jax.types import VideoSpec
 from egosim_jax.worlds.tabletop import World, start_of_sequence
-from egosim_jax.worlds.tabletop.hand_motion import Grip
 
 VIDEO = VideoSpec(frames=17, height=24, width=40, fps=8)
 
@@ -32,13 +32,6 @@ def test_a_row_is_the_pose_that_it_was_made_of(side):
     spec = ActionSpec(sides=(side,), camera=True)
     pose = Pose.of_row(spec.rest, side)
     np.testing.assert_allclose(pose.row(side, np.zeros(6)), spec.rest, atol=1e-9)
-
-
-def test_a_grip_is_the_pose_that_it_was_made_of():
-    grip = Grip(point_m=np.array([0.1, 0.2, 0.05]), yaw=0.4, pitch=0.9, closure=0.3)
-    back = Pose.of_grip(grip).grip()
-    assert (back.yaw, back.pitch) == pytest.approx((0.4, 0.9))
-    np.testing.assert_array_equal(Pose.of_grip(grip).row("right", np.zeros(6)).shape, 13)
 
 
 def test_a_driven_hand_closes_when_it_is_there(scene):
@@ -56,17 +49,28 @@ def test_a_driven_hand_closes_when_it_is_there(scene):
     assert path[-1].closure == pytest.approx(0.6)
 
 
-def test_the_true_world_puts_an_object_where_it_is_carried(scene):
-    spec = ActionSpec(camera=True)
-    before = Pose.of_row(spec.rest, "right")
-    place = np.array([-0.05, 0.2])
-    intent = intent_of("carry", scene, "red box", place)
-    assert intent.caption == "picks up the red box and puts it down to the left."
-    poses = [before, *perform(scene, intent, before, "right", 17)]
-    rows = np.clip([pose.row("right", np.zeros(6)) for pose in poses], *spec.bounds)
-    camera = start_of_sequence(0, spec=VIDEO)[1]
+@pytest.mark.parametrize(
+    ("table", "side", "name", "place"),
+    [
+        (0, "right", "red box", (-0.05, 0.2)),
+        (2, "left", "suggested", None),
+        (3, "right", "suggested", None),
+    ],
+)
+def test_the_true_world_puts_an_object_where_it_is_carried(table, side, name, place):
+    """The hand starts at rest, below the tops of tall objects."""
+    scene, camera, *_ = start_of_sequence(table, spec=VIDEO)
+    spec = ActionSpec(sides=(side,), camera=True)
+    before = Pose.of_row(spec.rest, side)
+    if name == "suggested":
+        name, place = suggest_goal(scene, side)
+    intent = intent_of("carry", scene, name, np.array(place))
+    words = f"picks up the {name} and puts it down to the"
+    assert intent.caption.startswith(words)
+    poses = [before, *perform(scene, intent, before, side, 17)]
+    rows = np.clip([pose.row(side, np.zeros(6)) for pose in poses], *spec.bounds)
     action, _ = spec.to_action(rows, camera=camera, prompt=intent.caption)
-    after = World(scene=scene).move(action)[1].scene.body("red box")
+    after = World(scene=scene).move(action)[1].scene.body(name)
     np.testing.assert_allclose(after.world_from_body[:2, 3], place, atol=0.01)
 
 

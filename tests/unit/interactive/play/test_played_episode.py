@@ -70,14 +70,6 @@ def test_the_account_of_a_clip_has_the_notes_and_what_moved(tmp_path):
     assert played.account() == []
 
 
-def test_a_closed_episode_films_what_was_asked_of_it_and_no_more(played):
-    carry(played)
-    played.close()
-    assert played.now.truth.result()[1].shape == played.now.frames.shape
-    with pytest.raises(RuntimeError, match="after shutdown"):
-        carry(played)
-
-
 def test_a_moment_is_returned_to_and_its_future_is_forgotten_by_another_clip(played):
     first = snapshot.fingerprint(played.state)
     carry(played)
@@ -94,14 +86,6 @@ def test_a_moment_is_returned_to_and_its_future_is_forgotten_by_another_clip(pla
     assert len(played.moments) == 3
     with pytest.raises(InputError, match="no moment 3: choose one from 0 to 2"):
         played.go_to(3)
-
-
-def test_the_same_clip_from_the_same_moment_is_the_same(played):
-    carry(played)
-    frames = played.now.frames
-    played.go_to(0)
-    carry(played)
-    np.testing.assert_array_equal(played.now.frames, frames)
 
 
 def test_what_was_played_is_recorded_and_can_be_simulated(played):

@@ -2,7 +2,8 @@
 
 import pytest
 
-from egosim_jax.interactive.server.store import Limits, Store
+from egosim_jax.interactive.options import Limits
+from egosim_jax.interactive.server.store import Store
 from tests.painted import painted
 from tests.unit.interactive.server.served import run
 

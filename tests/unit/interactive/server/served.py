@@ -7,9 +7,11 @@ import urllib.request
 
 import numpy as np
 
-from egosim_jax.interactive.server.server import bind, serve
+from egosim_jax.interactive.options import Limits
+from egosim_jax.interactive.origins import bind
+from egosim_jax.interactive.server.server import serve
 from egosim_jax.interactive.server.service import Service
-from egosim_jax.interactive.server.store import Limits, Store
+from egosim_jax.interactive.server.store import Store
 from tests.painted import painted
 
 TOKEN = "secret"  # noqa: S105

@@ -2,9 +2,7 @@
 
 import io
 import json
-import os
 import shutil
-import subprocess
 
 import numpy as np
 import pytest
@@ -12,23 +10,13 @@ from PIL import Image
 
 from egosim_jax.cli.export import Export
 from egosim_jax.data.shards import ShardReader
-from egosim_jax.interactive.server import dataset_export
-from egosim_jax.interactive.server.store import Limits, Store
+from egosim_jax.interactive.options import Limits
+from egosim_jax.interactive.server import dataset_export, session
+from egosim_jax.interactive.server.store import Store
 from egosim_jax.io.untrusted.parquet import read_parquet
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.types import WAN_GRID, InputError
 from tests.painted import VIDEO, painted
-
-LOADED = """
-import json, sys, numpy as np
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
-found = LeRobotDataset("egosim/test", root=sys.argv[1])
-items = [found[n] for n in range(len(found))]
-frames = np.stack([(x["observation.images.ego"].numpy() * 255).round() for x in items])
-np.savez(sys.argv[2], frames=frames.astype(np.uint8).transpose(0, 2, 3, 1),
-    actions=np.stack([x["action"].numpy() for x in items]),
-    tasks=[x["task"] for x in items], episodes=found.num_episodes)
-"""
 
 
 @pytest.fixture(scope="module")
@@ -79,22 +67,6 @@ def test_a_lerobot_dataset_has_the_frames_and_actions(folder, tmp_path):
     np.testing.assert_array_equal(rows, actions)
 
 
-@pytest.mark.skipif(
-    "LEROBOT_PYTHON" not in os.environ,
-    reason="no LEROBOT_PYTHON: lerobot pins other versions",
-)
-def test_lerobots_own_loader_reads_the_same(folder, tmp_path):
-    dataset_export.to_lerobot(dataset_export.open_sessions(folder)[0], tmp_path / "set")
-    command = [os.environ["LEROBOT_PYTHON"], "-c", LOADED, str(tmp_path / "set"), "found.npz"]
-    environment = {**os.environ, "HF_HUB_OFFLINE": "1", "PYTHONPATH": ""}
-    subprocess.run(command, check=True, cwd=tmp_path, env=environment)
-    frames, actions = expected(folder)
-    with np.load(tmp_path / "found.npz") as found:
-        np.testing.assert_array_equal(found["frames"], frames)
-        np.testing.assert_array_equal(found["actions"], actions)
-        assert found["episodes"] == 2
-
-
 def test_shards_have_a_clip_for_each_step(folder, tmp_path):
     sessions, _ = dataset_export.open_sessions(folder)
     dataset_export.to_shards(sessions, tmp_path / "shards", grid=WAN_GRID)
@@ -138,3 +110,54 @@ def test_a_damaged_session_does_not_keep_the_others_from_export(folder, tmp_path
     assert json.loads((tmp_path / "set" / "meta" / "info.json").read_text())["total_episodes"] == 2
     with pytest.raises(InputError, match="Session bad cannot be exported"):
         dataset_export.open_sessions(copy, ["bad"])
+
+
+def edit(path, change):
+    value = json.loads(path.read_text())
+    change(value)
+    path.write_text(json.dumps(value))
+
+
+def replace_frames(path):
+    frames = np.load(path)["frames"]
+    np.savez(path, frames=frames[:, :-16])
+
+
+@pytest.mark.parametrize(
+    ("file", "change"),
+    [
+        ("steps/2/request.json", lambda v: v["rows"][2].__setitem__(0, float("nan"))),
+        ("steps/2/request.json", lambda v: v["rows"][2].__setitem__(0, 9.0)),
+        ("steps/2/request.json", lambda v: v["rows"][2].__setitem__(0, v["rows"][2][0] + 0.01)),
+        ("steps/2/request.json", lambda v: v.update(prompt="other")),
+        ("closed.json", lambda v: v["video"].update(fps=30)),
+        ("closed.json", lambda v: v["video"].update(width=176)),
+        ("closed.json", lambda v: v["actions"].update(sides=["left"])),
+        ("steps/2/rollout/clip_1/frames.npz", None),
+        ("steps/2/info.json", None),
+    ],
+)
+def test_an_edited_session_is_skipped(folder, tmp_path, file, change):
+    copy = tmp_path / "sessions"
+    shutil.copytree(folder, copy)
+    shutil.copytree(folder / "one", copy / "bad")
+    if change is not None:
+        edit(copy / "bad" / file, change)
+    elif file.endswith(".npz"):
+        replace_frames(copy / "bad" / file)
+    else:
+        (copy / "bad" / file).write_text("[]")
+    readable, damaged = dataset_export.open_sessions(copy)
+    assert ([s.id for s in readable], list(damaged)) == (["one"], ["bad"])
+
+
+@pytest.mark.parametrize("value", [np.nan, 9.0])
+def test_rows_out_of_bounds_are_skipped_even_if_their_hash_is_right(folder, tmp_path, value):
+    shutil.copytree(folder, tmp_path / "sessions")
+    path = tmp_path / "sessions" / "one" / "steps" / "2" / "request.json"
+    fields = json.loads(path.read_text())
+    del fields[session.SEAL]
+    fields["rows"][2][0] = value
+    session._write_sealed(path, fields)
+    with pytest.raises(InputError, match="cannot be exported: Row 2"):
+        dataset_export.open_sessions(tmp_path / "sessions", ["one"])

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from egosim_jax.interactive.options import Limits
 from egosim_jax.interactive.server.client import Client
 from egosim_jax.interactive.server.errors import RequestError
-from egosim_jax.interactive.server.store import Limits, Store
+from egosim_jax.interactive.server.parts import Parts
+from egosim_jax.interactive.server.store import Store
 from egosim_jax.types import InputError
 from tests.painted import VIDEO, ChunkPainter, PaintedWorld
 from tests.unit.interactive.server.served import run, step
@@ -85,7 +87,8 @@ def test_open_steps_are_limited_and_an_idle_one_makes_room(store):
     with pytest.raises(RequestError) as refused:
         part(store, two, 1, given[:2])
     assert (refused.value.status, refused.value.code) == (429, "too_many_open_steps")
-    store.parts._idle_s = 0.0
+    store.parts = Parts(most=1, idle_s=0.0)
+    part(store, one, 1, given[:2])
     part(store, two, 1, given[:2])
     with pytest.raises(RequestError, match="cannot follow part 0"):
         part(store, one, 2, given[2:])

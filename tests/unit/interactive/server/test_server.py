@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 import websockets.sync.client
 
+from egosim_jax.interactive.origins import bind
 from egosim_jax.interactive.server import wire
 from egosim_jax.interactive.server.client import Client
 from egosim_jax.interactive.server.errors import RequestError
-from egosim_jax.interactive.server.server import _Server, bind
-from egosim_jax.interactive.server.service import Service
-from egosim_jax.interactive.server.store import Limits, Store
 from egosim_jax.types import InputError
-from tests.painted import VIDEO, PaintedWorld, Painter, painted
+from tests.painted import VIDEO, PaintedWorld, Painter
 from tests.unit.interactive.server.served import http, run
 
 
@@ -40,12 +38,12 @@ def test_two_clients_step_their_sessions_and_one_continues_the_others(server):
 
 def test_a_client_that_vanishes_loses_nothing(server):
     _, port = server
-    client = Client(f"ws://127.0.0.1:{port}")
-    session = client.create(seed=3)
+    with Client(f"ws://127.0.0.1:{port}") as client:
+        session = client.create(seed=3)
     rows = np.tile(session.reply["row"], (4, 1))
     fields = {"session": session.id, "step_id": 1, "actions": rows}
-    client._socket.send(wire.pack({"request": "step", **fields}))
-    client.close()
+    with websockets.sync.client.connect(f"ws://127.0.0.1:{port}") as vanishing:
+        vanishing.send(wire.pack({"request": "step", **fields}))
     with Client(f"ws://127.0.0.1:{port}") as again:
         assert again.attach(session.id).step_id in (0, 1)
         found = again.attach(session.id)
@@ -103,22 +101,6 @@ def test_a_streamed_step_is_shown_before_it_is_decoded(gated):
     assert b"egosim_first_frames_seconds_count 1.0" in http(port, "/metrics")[1]
 
 
-def test_the_messages_of_a_streamed_step(gated):
-    painter, _, port = gated
-    painter.opened.set()
-    with Client(f"ws://127.0.0.1:{port}") as client:
-        session = client.create(seed=3)
-        fields = {"session": session.id, "step_id": 1, "actions": session.reply["row"][None]}
-        client._socket.send(wire.pack({"request": "step", "stream": True, "observe": [], **fields}))
-        found = [wire.unpack(client._socket.recv(timeout=30)) for _ in range(3)]
-        for number, count in ((0, 1), (1, 4)):
-            group = found[number]
-            assert group.keys() == {"session", "step_id", "first_frame", "frames"}
-            assert (group["step_id"], group["first_frame"]) == (1, number)
-            assert group["frames"].shape == (count, 32, 48, 3)
-        assert (found[2]["step_id"], "frames" in found[2]) == (1, False)
-
-
 def test_a_client_that_vanishes_in_a_stream_leaves_its_step_to_be_made(gated):
     painter, service, port = gated
     client = Client(f"ws://127.0.0.1:{port}")
@@ -162,26 +144,6 @@ def test_an_error_ends_a_stream_and_the_connection_stays(gated, monkeypatch):
         assert session.step(rows, show=shown.append)["step_id"] == 1
 
 
-def test_a_world_that_does_not_stream_shows_a_clip_at_once(server):
-    with Client(f"ws://127.0.0.1:{server[1]}") as client:
-        session, shown = client.create(seed=3), []
-        reply = session.step(np.tile(session.reply["row"], (4, 1)), show=shown.append)
-        assert len(shown) == 1
-        np.testing.assert_array_equal(shown[0], reply["frames"])
-
-
-def test_http_does_not_stream(server):
-    _, port = server
-    session = json.loads(http(port, "/sessions", {"seed": 3})[1])
-    fields = {"step_id": 1, "actions": [session["row"]], "stream": True}
-    status, body = http(port, f"/sessions/{session['session']}/step", fields)
-    error = json.loads(body)
-    assert (status, error["code"]) == (422, "invalid")
-    assert "Connect there, or omit stream. (stream)" in error["message"]
-    fields["stream"] = False
-    assert http(port, f"/sessions/{session['session']}/step", fields)[0] == 200
-
-
 def test_http_has_the_same_requests(server):
     _, port = server
     status, body = http(port, "/sessions", {"seed": 3})
@@ -208,10 +170,6 @@ def test_health_and_metrics(server):
     assert b"egosim_sessions" in http(port, "/metrics")[1]
 
 
-def test_no_page_of_the_server_runs_scripts_of_another(server):
-    assert {http(server[1], path)[0] for path in ("/docs", "/redoc")} == {404}
-
-
 def test_a_client_waits_while_the_server_is_full(server, monkeypatch):
     service, port = server
     create, refusals = service.store.create, []
@@ -234,30 +192,17 @@ def test_a_client_waits_while_the_server_is_full(server, monkeypatch):
 
 def test_text_and_damaged_messages_are_refused_and_the_connection_stays(server):
     _, port = server
+    with websockets.sync.client.connect(f"ws://127.0.0.1:{port}") as socket:
+        socket.recv()
+        for data in ("text", b"", b"\xc1", wire.pack([1]), wire.pack({"request": "fly"})):
+            socket.send(data)
+            assert json.loads(socket.recv())["status"] == 422
     with Client(f"ws://127.0.0.1:{port}") as client:
-        for data in ("text", b"\xc1", wire.pack([1]), wire.pack({"request": "fly"})):
-            client._socket.send(data)
-            assert json.loads(client._socket.recv())["status"] == 422
         with pytest.raises(RequestError, match="observe has"):
             client.request("create", observe=[np.zeros(2)])
         with pytest.raises(RequestError, match="no field 'seeds'"):
             client.request("create", seeds=3)
         assert client.request("status")["draining"] is False
-
-
-def test_an_interrupted_request_closes_the_connection(server, monkeypatch):
-    _, port = server
-    client = Client(f"ws://127.0.0.1:{port}")
-    session = client.create(seed=3)
-    monkeypatch.setattr(client, "_received", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        session.step(session.reply["row"][None])
-    with pytest.raises(websockets.exceptions.ConnectionClosed):
-        session.status()
-
-
-def interrupt():
-    raise KeyboardInterrupt
 
 
 def test_another_address_needs_a_token():
@@ -281,18 +226,3 @@ def test_a_defect_is_logged_and_counted(server, monkeypatch, capsys):
         assert http(port, "/sessions")[0] == 500
     assert "no space" in capsys.readouterr().err
     assert b'egosim_refused_total{code="internal"} 1.0' in http(port, "/metrics")[1]
-
-
-def test_sigterm_drains_then_ends(tmp_path):
-    import uvicorn
-
-    service = Service(Store(tmp_path, painted(), Limits()), world="painted")
-    server = _Server(uvicorn.Config(lambda: None), service)
-    server.handle_exit(15, None)
-    for _ in range(100):
-        if server.should_exit:
-            break
-        threading.Event().wait(0.05)
-    assert server.should_exit
-    assert service.store.draining
-    service.store.close()

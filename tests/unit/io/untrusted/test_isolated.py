@@ -47,31 +47,39 @@ def test_columns_come_back_as_they_are(tmp_path):
     assert read_parquet(tmp_path / "a.parquet", ["a", "b"], optional=["c", "d"]) == table
 
 
+def _pid(path):
+    return os.getpid()
+
+
+def _crash(path):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _sleep(path):
+    time.sleep(600)
+
+
+def _busy(path):
+    while True:
+        pass
+
+
 def test_an_error_names_the_file_and_the_child_lives_on(path):
+    child = isolated.read_file(_pid, path)
     with pytest.raises(InputError, match=r"a\.h5: x has shape"):
         read_hdf5(path, {"x": (4, 4)})
-    process = isolated._READER._process
-    read_hdf5(path, {"y": (1,)})
-    assert isolated._READER._process is process
+    assert isolated.read_file(_pid, path) == child != os.getpid()
 
 
-def test_a_crash_is_reported_and_the_next_file_is_read(path):
-    read_hdf5(path, {"y": (1,)})
-    os.kill(isolated._READER._process.pid, signal.SIGSTOP)
-    os.kill(isolated._READER._process.pid, signal.SIGKILL)
-    isolated._READER._process.poll = lambda: None  # as if it ended while it reads
-    with pytest.raises(InputError, match="crash"):
-        read_hdf5(path, {"y": (1,)})
-    assert read_hdf5(path, {"y": (1,)}).arrays["y"].tolist() == [0.5]
-
-
-def test_a_hang_is_ended_after_the_time_limit(path, monkeypatch):
-    read_hdf5(path, {"y": (1,)})
-    os.kill(isolated._READER._process.pid, signal.SIGSTOP)
-    monkeypatch.setattr(isolated, "TIMEOUT_S", 0.2)
+@pytest.mark.parametrize(
+    ("read", "message"), [(_crash, "crash"), (_sleep, "hangs on it"), (_busy, r"within 0\.5 s")]
+)
+def test_a_crash_or_a_hang_is_reported_and_the_next_file_is_read(path, monkeypatch, read, message):
+    isolated.read_file(_pid, path)
+    monkeypatch.setattr(isolated, "TIMEOUT_S", 5.0 if read is _busy else 0.5)
     then = time.monotonic()
-    with pytest.raises(InputError, match="hangs on it"):
-        read_hdf5(path, {"y": (1,)})
+    with pytest.raises(InputError, match=message):
+        isolated.read_file(read, path, max_cpu_s=0.5)
     assert time.monotonic() - then < 5
     monkeypatch.undo()
     assert read_hdf5(path, {"y": (1,)}).arrays["y"].tolist() == [0.5]
@@ -92,15 +100,6 @@ def test_many_equal_rows_are_refused_before_they_are_read(tmp_path):
     assert (tmp_path / "a.parquet").stat().st_size < 50_000
     with pytest.raises(InputError, match="declares 8,388,609 values"):
         read_parquet(tmp_path / "a.parquet", ["a"])
-
-
-def test_a_text_that_fills_the_memory_is_refused(tmp_path):
-    rows = pa.DictionaryArray.from_arrays(np.zeros(1 << 20, np.int32), ["x" * (1 << 20)])
-    pq.write_table(pa.table({"a": rows, "b": np.arange(1 << 20)}), tmp_path / "a.parquet")
-    with pytest.raises(InputError, match=r"a\.parquet needs more memory"):
-        read_parquet(tmp_path / "a.parquet", ["a"])
-    assert len(read_parquet(tmp_path / "a.parquet", ["b"])["b"]) == 1 << 20
-    isolated._READER.close()
 
 
 def chunk(path):
@@ -157,17 +156,6 @@ def test_a_small_file_that_expands_is_refused_within_a_gigabyte(tmp_path, monkey
     isolated._READER.close()
     (peak,) = re.findall(r"VmHWM:\s+(\d+) kB", peaks[0])
     assert int(peak) < 1 << 20
-
-
-def test_a_reader_that_computes_for_too_long_is_ended(path):
-    with pytest.raises(InputError, match=r"within 0\.5 s"):
-        isolated.read_file(_busy, path, max_cpu_s=0.5)
-    assert read_hdf5(path, {"y": (1,)}).arrays["y"].tolist() == [0.5]
-
-
-def _busy(path):
-    while True:
-        pass
 
 
 def test_a_child_ends_with_a_parent_that_is_killed():

@@ -30,14 +30,14 @@ def test_arrays_of_either_order_are_read(tmp_path, order):
 SHAPES = [(), (0,), (7,), (2, 3), (1, 0, 5), (12, 1, 1, 3)]
 
 
-@pytest.mark.parametrize("shape", SHAPES, ids=str)
 @pytest.mark.parametrize("dtype", ["<f4", ">f8", "<f2", "u1", "?", "<i8", ">u4"])
 @pytest.mark.parametrize("order", ["C", "F"])
-def test_every_array_of_numbers_is_read_as_by_numpy(shape, dtype, order):
-    values = np.random.default_rng(0).integers(0, 2, shape).astype(dtype, order=order)
-    found = read_npy(npy(values), "x")
-    assert found.dtype == values.dtype
-    np.testing.assert_array_equal(found, values)
+def test_every_array_of_numbers_is_read_as_by_numpy(dtype, order):
+    for shape in SHAPES:
+        values = np.random.default_rng(0).integers(0, 2, shape).astype(dtype, order=order)
+        found = read_npy(npy(values), "x")
+        assert found.dtype == values.dtype
+        np.testing.assert_array_equal(found, values)
 
 
 @pytest.mark.parametrize(

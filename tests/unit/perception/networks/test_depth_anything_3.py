@@ -7,11 +7,11 @@ import pytest
 import torch  # noqa: F401
 
 from egosim_jax.geometry import invert
-from egosim_jax.perception.estimates import CameraEstimate, Verdict
 from egosim_jax.perception.networks.depth_anything_3 import DepthAnything3, DepthAnything3Cameras
 from egosim_jax.perception.networks.worker import close_workers
+from egosim_jax.perception.video.estimates import CameraEstimate, Verdict
 from egosim_jax.types import Cameras, InputError
-from tests.unit.perception.cameras import room
+from tests.unit.perception.video.cameras import room
 
 PACKAGE = """
 from pathlib import Path

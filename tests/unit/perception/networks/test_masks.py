@@ -7,13 +7,13 @@ import pytest
 import torch
 from PIL import Image
 
-from egosim_jax.perception.estimates import HandTracks, Segmenter
 from egosim_jax.perception.networks.grounded import GroundedSam2, GroundedSam3
 from egosim_jax.perception.networks.grounding_dino import GroundingDino, groups, phrase_scores
 from egosim_jax.perception.networks.pixels import PixelSettings, resize_levels, to_images
 from egosim_jax.perception.networks.sam3 import MaskTools, Sam3
 from egosim_jax.perception.networks.tracking import EdgeTam, Sam2Tracker, Sam3Tracker
 from egosim_jax.perception.networks.worker import close_workers
+from egosim_jax.perception.video.estimates import HandTracks, Segmenter
 from egosim_jax.types import InputError
 from tests.unit.perception.networks import tiny
 

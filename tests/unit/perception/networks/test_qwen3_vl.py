@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from egosim_jax.perception.estimates import Captioner
 from egosim_jax.perception.networks.qwen3_vl import Qwen3VL, chat, parse_reply
 from egosim_jax.perception.networks.worker import NetworkError, close_workers
+from egosim_jax.perception.video.estimates import Captioner
 from egosim_jax.types import InputError
 from tests.unit.perception.networks import tiny
 

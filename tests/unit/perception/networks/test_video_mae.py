@@ -8,9 +8,9 @@ import torch
 
 from egosim_jax.cli.table import TableCommand
 from egosim_jax.evaluation.fvd import frechet_distance
-from egosim_jax.io.video import read_video, write_video
+from egosim_jax.io.video import read_video
+from egosim_jax.io.writing import write_video
 from egosim_jax.perception.networks import VideoMae, close_workers
-from egosim_jax.types import InputError
 from tests.unit.perception.networks import tiny
 
 pytestmark = pytest.mark.slow
@@ -60,8 +60,3 @@ def test_a_table_has_the_distance_of_its_groups(folder, make_clips, tmp_path):
     expected = frechet_distance(*(np.stack(vectors) for vectors in features.values()))
     assert report["splits"]["egodex"]["dark"]["fvd"]["mean"] == pytest.approx(expected, rel=1e-4)
     assert "fvd_video" not in (tmp_path / "out" / "metrics.jsonl").read_text()
-
-
-def test_other_checkpoints_are_refused(tmp_path):
-    with pytest.raises(InputError, match="VideoMAE"):
-        VideoMae(tiny.depth_anything(tmp_path))

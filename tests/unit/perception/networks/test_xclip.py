@@ -7,7 +7,6 @@ import torch
 from egosim_jax.generation import rank
 from egosim_jax.perception.networks import close_workers
 from egosim_jax.perception.networks.xclip import XClip
-from egosim_jax.types import InputError
 from tests.unit.perception.networks import tiny
 
 pytestmark = pytest.mark.slow
@@ -45,8 +44,3 @@ def test_candidates_are_ranked_by_a_text(folder, videos):
     assert found["a"] != found["b"]
     best = rank.order(found)[0].name
     assert best == max(found, key=lambda name: found[name])
-
-
-def test_other_checkpoints_are_refused(tmp_path):
-    with pytest.raises(InputError, match="X-CLIP"):
-        rank.by_text(TEXTS[0], tiny.depth_anything(tmp_path))

@@ -1,0 +1,264 @@
+"""Pushes: a hand or an object that enters an object from the side moves it.
+
+A pushed object slides on its support, and turns by the friction under it. The limit surface is an
+ellipsoid: a force f at r from the center gives the velocity v = f and the turn w = (r x f) / c^2,
+with c the radius of gyration of the pressure (Goyal, Ruina and Papadopoulos 1991). An object that
+was pushed pushes the next one.
+
+Not every part of a hand that is inside an object pushes it: fingers come from above, close around
+an object, or open in it. A point of the hand that once did not push an object only presses on it
+until it leaves it.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from egosim_jax.dynamics.grips import contact_of
+from egosim_jax.dynamics.hands import HandTrack
+from egosim_jax.dynamics.solids import Solid
+from egosim_jax.dynamics.support import Body, apart, carry_riders
+from egosim_jax.dynamics.walk import Walk
+from egosim_jax.geometry import rotation_z, transform
+from egosim_jax.rendering.skeleton import SKELETONS
+from egosim_jax.types import Kind
+
+FLESH_M: dict[Kind, float] = {"human": 0.008, "robot": 0.006}
+"""Radius of flesh around joints and bones, in meters."""
+JAW_SHARES = (0.2, 0.4, 0.6)
+"""Places of touching points along a jaw, from its tip, as fractions of the way to the wrist."""
+STEEP = 0.7
+"""Vertical component of a normal above which a point presses on an object."""
+DESCENT = 0.15
+"""Descent per horizontal motion from which an open hand comes down on an object."""
+FACING = 0.4
+"""Component of a normal along the opening of a hand from which a side of an object faces a tip."""
+STEP_M = 0.006
+"""Maximum motion of a joint between two contacts, in meters."""
+MAX_STEPS = 16
+"""Maximum number of contacts between two frames."""
+MAX_PUSHES = 8
+"""Maximum number of pushes of one object in one contact: two fingers may squeeze it."""
+LEAVE_M = (0.003, 0.010)
+"""Distances of flesh and of the pinch point at which a hand has left an object, in meters."""
+CLOSES_SOON = 3
+"""Frames before a grip in which the hand does not push the object that it closes on."""
+FITS_M = 0.012
+"""Excess width of an object that still fits in an open hand, in meters: hulls err."""
+OVERLAP_M = 0.004
+"""Maximum overlap of two hulls before a push, in meters; deeper ones are errors of the hulls."""
+
+
+def push(walk: Walk) -> None:
+    """Push objects out of the hands, and out of the objects that moved."""
+    for hand, track in walk.tracks.items():
+        if not track.present[walk.frame - 1 : walk.frame + 1].all():
+            continue
+        before, after = track.joints_m[walk.frame - 1 : walk.frame + 1]
+        if walk.frame == 1 or not track.present[walk.frame - 2]:
+            _appear(walk, hand, before)
+        length = float(np.linalg.norm(after - before, axis=-1).max())
+        steps = int(np.clip(np.ceil(length / STEP_M), 1, MAX_STEPS))
+        for number in walk.solids:
+            if _may_push(walk, hand, number, length):
+                for share in np.arange(1, steps + 1) / steps:
+                    joints = before + share * (after - before)
+                    _push_one(walk, hand, number, joints, (after - before) / steps)
+    _push_on(walk)
+
+
+def _flesh_m(track: HandTrack) -> float:
+    """Return the radius of a hand's flesh; a noisy hand must be surely inside an object."""
+    return FLESH_M[_kind(track)] - 2 * track.sigma_m
+
+
+def _kind(track: HandTrack) -> Kind:
+    return "human" if track.joints_m.shape[1] == len(SKELETONS["human"].colors) else "robot"
+
+
+@cache
+def _touching(kind: Kind) -> Float[np.ndarray, "p j"]:
+    """Return the weights of the joints in each touching point: joints, and points between them."""
+    joints = np.eye(len(SKELETONS[kind].colors))
+    if kind == "robot":  # the jaws are parallel
+        back = joints[0] - joints[1:].mean(axis=0)
+        between = [tip + share * back for tip in joints[1:] for share in JAW_SHARES]
+    else:
+        between = [joints[list(bone)].mean(axis=0) for bone in _bones(kind)]
+    return np.concatenate([joints, between])
+
+
+def _bones(kind: Kind) -> list[tuple[int, int]]:
+    return [(int(first), int(last)) for first, last in SKELETONS[kind].bones]
+
+
+@cache
+def _fingers(kind: Kind) -> Bool[np.ndarray, " p"]:
+    """Return which touching points are on fingers or jaws, and not on the palm."""
+    palm = [0, 1, 5, 9, 13, 17] if kind == "human" else [0]
+    return _touching(kind)[:, palm].sum(axis=1) < 1
+
+
+def _appear(walk: Walk, hand: int, joints_m: Float[np.ndarray, "j 3"]) -> None:
+    """Note the points that are inside objects when a hand appears."""
+    track = walk.tracks[hand]
+    points = _touching(_kind(track)) @ joints_m
+    for number, solid in walk.solids.items():
+        inside = solid.distance(points, walk.poses[number]) < _flesh_m(track)
+        walk.pressing |= {(hand, int(point), number) for point in np.flatnonzero(inside)}
+
+
+def _may_push(walk: Walk, hand: int, number: int, length_m: float) -> bool:
+    """Return True if a hand is near an object that it neither holds nor is about to hold."""
+    if number in walk.furniture or number in walk.in_hands:
+        return False
+    track, solid, pose = walk.tracks[hand], walk.solids[number], walk.poses[number]
+    center = transform(pose, solid.center_m[None])[0]
+    gaps = np.linalg.norm(track.joints_m[walk.frame] - center, axis=1)
+    if gaps.min() > solid.radius_m + length_m + LEAVE_M[1]:
+        return False
+    soon = range(walk.frame, walk.frame + CLOSES_SOON + 1)
+    if walk.given.get(hand) == number and walk.holds[hand][0].begin in soon:
+        return False
+    return not any(
+        hold.begin in soon and hold.closes and contact_of(solid, pose, track, hold)
+        for hold in walk.holds[hand]
+    )
+
+
+def _push_one(
+    walk: Walk,
+    hand: int,
+    number: int,
+    joints_m: Float[np.ndarray, "j 3"],
+    way_m: Float[np.ndarray, "j 3"],
+) -> None:
+    """Push an object out of the flesh of a hand that enters it from the side."""
+    solid, track, pose = walk.solids[number], walk.tracks[hand], walk.poses[number]
+    weights, flesh = _touching(_kind(track)), _flesh_m(track)
+    points = weights @ joints_m
+    distances = solid.distance(points, pose)
+    inside = distances < flesh
+    if solid.distance(track.pinch_m[walk.frame][None], pose)[0] > LEAVE_M[1]:
+        for point in np.flatnonzero(distances > flesh + LEAVE_M[0]):
+            walk.pressing.discard((hand, int(point), number))
+        if not inside.any():
+            walk.left.discard((hand, number))
+    entering = [
+        int(point)
+        for point in np.flatnonzero(inside)
+        if (hand, int(point), number) not in walk.pressing
+    ]
+    if not entering:
+        return
+    if (hand, number) in walk.left:
+        presses = set(entering)
+    else:
+        yields = _yields(walk, hand, number, weights @ way_m)
+        presses = {point for point in entering if yields[point]}
+        rest = [point for point in entering if not yields[point]]
+        motion, pressing = push_out(solid, pose, points[rest], flesh)
+        presses |= {rest[index] for index in np.flatnonzero(pressing)}
+        if motion is not None:
+            carry_riders(walk, number, motion @ pose, hand)
+            walk.move(number, motion @ pose, "pushed", hand)
+    walk.pressing |= {(hand, point, number) for point in presses}
+
+
+def _yields(
+    walk: Walk, hand: int, number: int, way_m: Float[np.ndarray, "p 3"]
+) -> Bool[np.ndarray, " p"]:
+    """Return which points of a hand yield to an object, because the hand reaches around it.
+
+    The object must fit in the hand. Fingers yield while it is between thumb and fingers. Before,
+    all points yield that come down on it.
+    """
+    track, solid, pose = walk.tracks[hand], walk.solids[number], walk.poses[number]
+    thumb, fingers = track.tips_m[walk.frame]
+    opening = fingers - thumb
+    size = max(float(np.linalg.norm(opening)), 1e-9)
+    level = opening * [1, 1, 0] / max(float(np.hypot(*opening[:2])), 1e-9)
+    if size < solid.width_along(level, pose) - FITS_M:
+        return np.zeros(len(way_m), bool)
+    falls = -way_m[:, 2] > DESCENT * np.linalg.norm(way_m[:, :2], axis=1)
+    first, second = (solid.normal(tip, pose)[1] @ opening / size for tip in (thumb, fingers))
+    around = first < -FACING and second > FACING
+    return falls | _fingers(_kind(track)) if around else falls
+
+
+def push_out(
+    solid: Solid,
+    pose: Float[np.ndarray, "4 4"],
+    points_m: Float[np.ndarray, "p 3"],
+    flesh_m: float,
+) -> tuple[Float[np.ndarray, "4 4"] | None, Bool[np.ndarray, " p"]]:
+    """Return the motion of a solid out of the flesh around points, the deepest one first.
+
+    Also returns which points press instead, because they are above or below it. A push may turn the
+    solid under the next point, so that this is decided before each push. None without a push.
+    """
+    motion, pressing = None, np.zeros(len(points_m), bool)
+    for _ in range(MAX_PUSHES + len(points_m) if len(points_m) else 0):
+        now = pose if motion is None else motion @ pose
+        distances = solid.distance(points_m, now)
+        distances[pressing] = np.inf
+        deepest = int(distances.argmin())
+        if distances[deepest] >= flesh_m - 1e-6:
+            break
+        distance, normal = solid.normal(points_m[deepest], now)
+        if abs(normal[2]) > STEEP:
+            pressing[deepest] = True
+            continue
+        step = _slide(solid, now, points_m[deepest], normal, flesh_m - distance)
+        motion = step if motion is None else step @ motion
+    return motion, pressing
+
+
+def _slide(
+    solid: Solid,
+    pose: Float[np.ndarray, "4 4"],
+    point_m: Float[np.ndarray, " 3"],
+    normal: Float[np.ndarray, " 3"],
+    depth_m: float,
+) -> Float[np.ndarray, "4 4"]:
+    """Return the motion of a solid by the depth of a point in it; the normal is not vertical."""
+    level = float(np.hypot(normal[0], normal[1]))
+    force = -np.array([normal[0], normal[1], 0.0]) / level
+    center = transform(pose, solid.center_m[None])[0]
+    lever = point_m - center
+    torque = float(lever[0] * force[1] - lever[1] * force[0])
+    square = solid.gyration_m**2
+    amount = depth_m / level / (1 + torque**2 / square)
+    motion = np.eye(4)
+    motion[:3, :3] = rotation_z(amount * torque / square)
+    motion[:3, 3] = center + amount * force - motion[:3, :3] @ center
+    return motion
+
+
+def _push_on(walk: Walk) -> None:
+    """Push resting objects out of the objects that moved in this frame."""
+    moved = [
+        number
+        for number, pose in walk.poses.items()
+        if np.abs(pose - walk.before(number)).max() > 1e-5
+    ]
+    for number in moved:
+        hand = walk.causes[number][-1].hand
+        solid = walk.solids[number]
+        body, body_before = Body(solid, walk.poses[number]), Body(solid, walk.before(number))
+        for other, resting in walk.solids.items():
+            if other in moved or other in walk.furniture or other in walk.in_hands:
+                continue
+            way = apart(Body(resting, walk.poses[other]), body)
+            if way is None:
+                continue
+            overlap = apart(Body(resting, walk.before(other)), body_before)
+            if overlap is not None and np.linalg.norm(overlap) > OVERLAP_M:
+                continue
+            pose = walk.poses[other].copy()
+            pose[:2, 3] += way
+            carry_riders(walk, other, pose, hand)
+            walk.move(other, pose, "pushed", hand)

@@ -1,0 +1,1 @@
+"""A clip in a known state: it judges the predicted motion, and shows new surfaces."""

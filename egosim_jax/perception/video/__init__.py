@@ -1,0 +1,1 @@
+"""A recorded video from nothing: cameras, depth, hands, scale, background, moved objects."""
