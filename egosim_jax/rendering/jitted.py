@@ -58,19 +58,29 @@ def render(
     missing = -count % block
     points = np.pad(state.points_m, ((0, missing), (0, 0)), constant_values=np.nan)
     paths = [(np.pad(moves, (0, missing)), path) for moves, path in paths_of(state, motion)]
-    if point_px == 1:
-        depth_m, index = close_gaps(*splat(points, add_margin(cameras), point_px=1, paths=paths))
-    else:
-        depth_m, index = splat(points, cameras, point_px=point_px, paths=paths)
+    depth_m, index = _seen_points(points, cameras, point_px, paths)
     check_visible(np.asarray(index[0]), count)
+    drawn = index
+    if paths:
+        _, before = _seen_points(points, cameras, point_px, ())
+        drawn = jnp.where(index < 0, before, index)
     colors = np.pad(state.colors, ((0, missing), (0, 0)))
     ids = np.pad(state.object_ids, (0, missing))
     return View(
-        frames=np.asarray(paint(index, colors, gamma=False)),
-        mask=np.asarray(unobserved(index, dilate=True)),
+        frames=np.asarray(paint(drawn, colors, gamma=False)),
+        mask=np.asarray(unobserved(drawn, dilate=True)),
         depth_m=np.asarray(depth_m),
         object_ids=np.asarray(_identify(index, ids)),
     )
+
+
+def _seen_points(
+    points_m: Float[np.ndarray, "n 3"], cameras: Cameras, point_px: int, paths: Paths
+) -> tuple[Float32[Array, "f h w"], Int32[Array, "f h w"]]:
+    """Return depth and index of the point seen by each pixel, with gaps closed (`splat`)."""
+    if point_px == 1:
+        return close_gaps(*splat(points_m, add_margin(cameras), point_px=1, paths=paths))
+    return splat(points_m, cameras, point_px=point_px, paths=paths)
 
 
 @jax.jit

@@ -114,23 +114,33 @@ def render(
 ) -> View:
     """Render a state along a camera path: Π of EgoSim's section 3.2.
 
-    Objects follow a predicted motion, if one is given; what they uncover is not observed. Gaps
-    between points of one pixel are closed. Raises `InputError` if the first frame shows no point.
+    Objects follow a predicted motion, if one is given. Where they uncover what no point shows, the
+    frames still have their image of before: a model draws it better from there than from a hole,
+    and the depth is infinite. Gaps between points of one pixel are closed. Raises `InputError` if
+    the first frame shows no point.
     """
     paths = paths_of(state, motion)
-    if point_px == 1:
-        depth_m, index = close_gaps(
-            *splat(state.points_m, add_margin(cameras), point_px=1, paths=paths)
-        )
-    else:
-        depth_m, index = splat(state.points_m, cameras, point_px=point_px, paths=paths)
+    depth_m, index = _seen_points(state, cameras, point_px, paths)
     check_visible(index[0], len(state.points_m))
+    drawn = index
+    if paths:
+        _, before = _seen_points(state, cameras, point_px, ())
+        drawn = np.where(index < 0, before, index)
     return View(
-        frames=paint(index, state.colors, gamma=False),
-        mask=unobserved(index, dilate=True),
+        frames=paint(drawn, state.colors, gamma=False),
+        mask=unobserved(drawn, dilate=True),
         depth_m=depth_m,
         object_ids=np.append(state.object_ids, np.int32(0))[index],
     )
+
+
+def _seen_points(
+    state: SceneState, cameras: Cameras, point_px: int, paths: Paths
+) -> tuple[Float32[np.ndarray, "f h w"], Int[np.ndarray, "f h w"]]:
+    """Return depth and index of the point seen by each pixel, with gaps closed (`splat`)."""
+    if point_px == 1:
+        return close_gaps(*splat(state.points_m, add_margin(cameras), point_px=1, paths=paths))
+    return splat(state.points_m, cameras, point_px=point_px, paths=paths)
 
 
 def paths_of(state: SceneState, motion: Motion | None) -> Paths:

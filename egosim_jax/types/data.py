@@ -192,9 +192,11 @@ class View(Shown):
     """Rendering of a state along a camera trajectory."""
 
     frames: UInt8[np.ndarray, "f h w 3"]
-    """Rendered colors; black where no point is visible."""
+    """Rendered colors; black where no point is visible.
+
+    Where an object has moved away from what no point shows, its image of before."""
     mask: UInt8[np.ndarray, "f h w"]
-    """Unobserved pixels: 255 not observed, 0 observed."""
+    """Unobserved pixels, black in the frames: 255 not observed, 0 observed."""
     depth_m: Float32[np.ndarray, "f h w"]
     """Depth along the camera's z axis in meters; infinite where no point is visible."""
     object_ids: Int32[np.ndarray, "f h w"]

@@ -274,15 +274,40 @@ def test_both_renderers_draw_objects_on_their_predicted_paths(scene, size):
         module.render(state, cameras, point_px=size, motion=Motion(paths=paths))
         for module in (reference, jitted)
     ]
+    still = reference.render(state, cameras, point_px=size)
     for frame in range(3):  # as a state whose points were moved before
         moved = state.points_m.copy()
         for number, path in paths.items():
             moved[ids == number] = transform(path.motion[frame], moved[ids == number].astype(float))
         alone = replace(cameras, world_from_camera=cameras.world_from_camera[frame : frame + 1])
         expected = reference.render(replace(state, points_m=moved), alone, point_px=size)
+        hole = np.isinf(expected.depth_m[0])[..., None]
+        frames = np.where(hole, still.frames[frame], expected.frames[0])
         for view in views:
             assert (view.object_ids[frame] != expected.object_ids[0]).mean() < DIFFERENT
-            assert (view.frames[frame] != expected.frames[0]).mean() < DIFFERENT
+            assert (view.frames[frame] != frames).mean() < DIFFERENT
+
+
+@pytest.mark.parametrize("renderer", [reference, jitted])
+def test_what_a_moved_object_uncovers_keeps_its_image_but_has_no_depth(renderer):
+    wall = make_points(range(HEIGHT), range(10), 2.0)
+    cup = make_points([8, 9, 10], [20, 21, 22], 1.0)
+    state = gray((90, wall), (200, cup))
+    state = replace(state, object_ids=np.repeat([0, 1], [len(wall), len(cup)]).astype(np.int32))
+    moved = np.eye(4)
+    moved[0, 3] = -15 / 30  # onto the wall: 15 pixels to the left
+    motion = np.stack([np.eye(4), moved])
+    path = Motion(paths={1: ObjectPath(motion=motion, causes=(), confidence=1.0)})
+    cameras = replace(FLAT, world_from_camera=np.eye(4)[None].repeat(2, axis=0))
+    view = renderer.render(state, cameras, point_px=1, motion=path)
+    assert (view.frames[1, 8:11, 5:8] == 200).all()
+    assert (view.object_ids[1, 8:11, 5:8] == 1).all()
+    old = np.s_[1, 8:11, 20:23]
+    assert (view.frames[old] == 200).all()
+    assert (view.mask[old] == 0).all()
+    assert np.isinf(view.depth_m[old]).all()
+    assert (view.object_ids[old] == 0).all()
+    assert (view.mask[:, :, 25:] == 255).all()
 
 
 def make_points(rows, columns, depth):
