@@ -21,12 +21,15 @@ from egosim_jax.state import snapshot
 from egosim_jax.types import JOINTS, Action, Cameras, GroundTruth, InputError, Kind, VideoSpec
 
 
-def episode_from(folder: Path, video: VideoSpec, *, clips: int | None = None) -> Episode:
+def episode_from(
+    folder: Path, video: VideoSpec, *, clips: int | None = None, every_frame: bool = False
+) -> Episode:
     """Return an episode made from an annotated clip, with the length, size and rate of `video`.
 
     Consecutive actions share a frame: the last frame of one is the first of the next. The
-    ground-truth frames are the nearest in time, cropped to the model's size, and so are the first
-    frame and the intrinsics. Raises `InputError` if the clip was refused or is too short.
+    ground-truth frames are the nearest in time, or every recorded one, cropped to the model's size,
+    and so are the first frame and the intrinsics. Raises `InputError` if the clip was refused or
+    is too short.
     """
     if not (folder / ANNOTATION).exists() and folder.parent.is_dir():
         places = folder.glob(f"*/{ANNOTATION}"), folder.parent.glob(f"*/{ANNOTATION}")
@@ -50,6 +53,8 @@ def episode_from(folder: Path, video: VideoSpec, *, clips: int | None = None) ->
     )
     recorded = read_video(folder / "video.mp4")
     moments = Timeline.even(len(recorded.frames), recorded.fps).at_rate(video.fps)
+    if every_frame:
+        moments = np.arange(len(recorded.frames))
     step = video.frames - 1
     possible = (len(moments) - 1) // step
     count = possible if clips is None else clips

@@ -42,7 +42,8 @@ class Render:
 
     Writes a video, a contact sheet, report.json, a LeRobot dataset (version 3.0) with joint
     positions, and training clips with the gripper's skeleton. The report names the frames that the
-    robot does not reach, and by how much.
+    robot does not reach, and by how much. The folder is complete or absent: a stopped command is
+    repeated.
     """
 
     source: Annotated[Path, tyro.conf.Positional]
@@ -66,6 +67,7 @@ class Render:
         from egosim_jax.data.clips import write_clips
         from egosim_jax.data.lerobot_writer import check_new
         from egosim_jax.data.sheet import SheetClip, draw_sheet
+        from egosim_jax.io.atomic import atomic_folder
         from egosim_jax.io.run import write_json
         from egosim_jax.io.writing import write_video
         from egosim_jax.rendering import get
@@ -87,18 +89,19 @@ class Render:
         source = open_source(self.source)
         episode = source.episode
         converted = convert(source, robot, hands=self.hands, base=self.base)
-        self.out.mkdir(parents=True, exist_ok=True)
-        write_video(self.out / VIDEO, video_of(converted), episode.fps)
         first, truth = converted.drawn[0], episode.ground_truth[0]
         rows = [truth.frames, converted.backgrounds[0].frames, first.frames]
         moments = [round(n * (len(truth.frames) - 1) / 5) for n in range(6)]
-        draw_sheet([SheetClip(arm.title, rows)], self.out / SHEET, moments=moments)
-        export(converted, self.out / DATASET)
         name = re.sub("[^A-Za-z0-9_-]+", "_", f"{self.source.resolve().stem}_{arm.name}")
-        write_clips(self.out / TRIPLETS, triplets_of(converted, name, get("jax")), fps=episode.fps)
         report = {"source": self.source, "kind": source.kind, **report_of(converted)}
-        seconds = round(time.monotonic() - began, 1)
-        write_json(self.out / REPORT, {**report, "seconds": seconds})
+        with atomic_folder(self.out) as out:
+            write_video(out / VIDEO, video_of(converted), converted.fps)
+            draw_sheet([SheetClip(arm.title, rows)], out / SHEET, moments=moments)
+            export(converted, out / DATASET)
+            triplets = triplets_of(converted, name, get("jax"))
+            write_clips(out / TRIPLETS, triplets, fps=converted.fps)
+            seconds = round(time.monotonic() - began, 1)
+            write_json(out / REPORT, {**report, "seconds": seconds})
         for entry in report["robots"]:
             print(_words(entry))
         if not any(entry["reached"] for entry in report["robots"]):

@@ -18,6 +18,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, no_type_check
@@ -102,7 +103,7 @@ def write_lerobot(
     episodes: Iterable[EpisodeRecord],
     *,
     names: Sequence[str],
-    fps: int,
+    fps: int | Fraction,
     robot_type: str,
     about: Mapping[str, Any] | None = None,
 ) -> None:
@@ -165,7 +166,7 @@ def _write_episode(
     folder: Path,
     clips: Iterable[ClipRecord],
     totals: _Totals,
-    fps: int,
+    fps: int | Fraction,
 ) -> None:
     number, images, prompts, steps = len(totals.episodes), [], [], []
     counted = []
@@ -184,7 +185,7 @@ def _write_episode(
     columns = {
         IMAGE: images,
         **{name: list(values) for name, values in vectors.items()},
-        "timestamp": (np.arange(count) / fps).astype(np.float32),
+        "timestamp": (np.arange(count) / float(fps)).astype(np.float32),
         "frame_index": np.arange(count),
         "episode_index": np.full(count, number),
         "index": np.arange(first, first + count),
@@ -232,7 +233,7 @@ def _write_meta(
     folder: Path,
     totals: _Totals,
     *,
-    fps: int,
+    fps: int | Fraction,
     robot_type: str,
     names: Sequence[str],
     about: Mapping[str, Any] | None,
@@ -263,7 +264,7 @@ def _write_meta(
         "chunks_size": CHUNK,
         "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200,
-        "fps": fps,
+        "fps": int(fps) if fps == int(fps) else float(fps),
         "splits": {"train": f"0:{len(totals.episodes)}"},
         "data_path": PATH,
         "video_path": None,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from itertools import chain
 from pathlib import Path
 from typing import Any, Literal, no_type_check
@@ -73,6 +74,11 @@ class Conversion:
         return self.source.episode
 
     @property
+    def fps(self) -> Fraction:
+        """Frames per second."""
+        return self.source.rate
+
+    @property
     def arm(self) -> Arm:
         """Arm of all robots."""
         return self.followers[0].robot.arm
@@ -101,13 +107,13 @@ def convert(
     world_from_up = up_frame(episode.state, joints[:, chosen], poses[0])
     followers = []
     for hand in chosen:
-        grips = grips_of(joints[:, hand], fps=episode.fps)
+        grips = grips_of(joints[:, hand], fps=float(source.rate))
         placed = place(
             robot,
             grips,
             world_from_up=world_from_up,
             cameras=cameras,
-            fps=episode.fps,
+            fps=float(source.rate),
             base=base,
         )
         followers.append(Follower(robot=robot, hand=hand, grips=grips, placed=placed))
@@ -209,7 +215,7 @@ def report_of(conversion: Conversion) -> dict[str, Any]:
     """Return the reached frames and the sources of the pixels behind hands, as JSON."""
     counts = ("from_state", "from_first_frame", "from_frames", "unknown", "shadow")
     return {
-        "robots": [_report(f, conversion.episode.fps) for f in conversion.followers],
+        "robots": [_report(f, float(conversion.fps)) for f in conversion.followers],
         "hand_pixels": {
             "all": sum(int(b.hidden.sum()) for b in conversion.backgrounds),
             **{name: sum(getattr(b, name) for b in conversion.backgrounds) for name in counts},
@@ -217,7 +223,7 @@ def report_of(conversion: Conversion) -> dict[str, Any]:
     }
 
 
-def _report(follower: Follower, fps: int) -> dict[str, Any]:
+def _report(follower: Follower, fps: float) -> dict[str, Any]:
     track, grips, arm = follower.placed.track, follower.grips, follower.robot.arm
     base = follower.placed.world_from_base
     pinch = track.base_from_grip[:, :3, 3] @ base[:3, :3].T + base[:3, 3]
@@ -272,7 +278,7 @@ def export(conversion: Conversion, folder: Path) -> None:
         folder,
         [record],
         names=names,
-        fps=conversion.episode.fps,
+        fps=conversion.fps,
         robot_type=conversion.arm.name,
     )
 

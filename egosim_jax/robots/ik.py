@@ -105,7 +105,7 @@ class Solver:
         base_from_grip: Float[np.ndarray, "f 4 4"],
         opening_m: Float[np.ndarray, " f"],
         *,
-        fps: int,
+        fps: int | float,
     ) -> Track:
         """Return the motion along a path from the posture `q`, at which the path begins."""
         openings = self._limit_opening(opening_m, fps)
@@ -149,7 +149,7 @@ class Solver:
             apart_m=np.array(apart),
         )
 
-    def _limit_opening(self, opening_m: np.ndarray, fps: int) -> Float[np.ndarray, " f"]:
+    def _limit_opening(self, opening_m: np.ndarray, fps: int | float) -> Float[np.ndarray, " f"]:
         """Return the openings that the gripper can have, at most at its speed, without jerks."""
         wanted = np.clip(opening_m, self.robot.openings_m[0], self.robot.openings_m[-1])
         wanted = gaussian_filter1d(wanted, GRADUAL_S * fps, mode="nearest")

@@ -65,7 +65,7 @@ def place(
     *,
     world_from_up: Float[np.ndarray, "4 4"],
     cameras: Cameras,
-    fps: int,
+    fps: int | float,
     base: Base | None = None,
 ) -> Placed:
     """Return the base from which the arm reaches most of the path, clear of the camera.

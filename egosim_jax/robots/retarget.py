@@ -48,7 +48,7 @@ def tips_of(joints_m: Float[np.ndarray, "*f j 3"]) -> tuple[np.ndarray, np.ndarr
     return joints_m[..., 4, :], joints_m[..., [8, 12], :].mean(axis=-2)
 
 
-def grips_of(joints_m: Float[np.ndarray, "f j 3"], *, fps: int) -> Grips:
+def grips_of(joints_m: Float[np.ndarray, "f j 3"], *, fps: int | float) -> Grips:
     """Return the grips of one hand; a missing hand has joints of NaN, but not in all frames."""
     seen = np.asarray(np.isfinite(joints_m).all(axis=(1, 2)))
     (known,) = np.nonzero(seen)

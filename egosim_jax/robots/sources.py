@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, no_type_check
 
@@ -56,6 +57,8 @@ class Source:
     """Actions and frames; the depth, ids and motions are ground truth or estimates."""
     states: tuple[SceneState, ...]
     """Scene before each clip."""
+    rate: Fraction
+    """Frames per second of the frames; `episode.fps` is the nearest whole number."""
     estimated: bool = False
     """True if depth, ids and motions are estimates."""
 
@@ -98,7 +101,7 @@ def of_episode(episode: Episode) -> Source:
     states = [episode.state]
     for truth in episode.ground_truth[:-1]:
         states.append(moved(states[-1], truth.motions or {}))
-    return Source(kind="episode", episode=episode, states=tuple(states))
+    return Source(kind="episode", episode=episode, states=tuple(states), rate=Fraction(episode.fps))
 
 
 def _annotated(path: Path) -> Source:
@@ -113,13 +116,13 @@ def _annotated(path: Path) -> Source:
     video = VideoSpec(
         frames=info.frames, height=info.height, width=info.width, fps=max(1, round(info.fps))
     )
-    episode = episode_from(path, video, clips=1)
+    episode = episode_from(path, video, clips=1, every_frame=True)
     frames = episode.ground_truth[0].frames
     masks = read_masks(path / MASKS, frames.shape[:3])
     config = ClassicalConfig()
     stages = (take_action, _KnownHands(masks), config.motion, config.moved, config.new)
     return _perceived(
-        "annotated clip", episode, [episode.state], [frames], [Pipeline(stages=stages)]
+        "annotated clip", episode, [episode.state], [frames], [Pipeline(stages=stages)], info.fps
     )
 
 
@@ -199,6 +202,7 @@ def _perceived(
     states: Sequence[SceneState],
     frames: Sequence[UInt8[np.ndarray, "f h w 3"]],
     perceptions: Sequence[Perception],
+    rate: Fraction | None = None,
 ) -> Source:
     """Return clips whose depth, ids and motions are those that perception finds."""
     before, truths = [], []
@@ -220,6 +224,7 @@ def _perceived(
         kind=kind,
         episode=replace(episode, ground_truth=tuple(truths)),
         states=tuple(before),
+        rate=Fraction(episode.fps) if rate is None else rate,
         estimated=True,
     )
 

@@ -11,6 +11,7 @@ pytest.importorskip("mink")
 import pyarrow.parquet as pq
 
 from egosim_jax.cli.__main__ import main
+from egosim_jax.cli.robot import Render
 from egosim_jax.data.clips import check_clip, write_clips
 from egosim_jax.data.metadata import read_metadata
 from egosim_jax.rendering import reference
@@ -126,6 +127,26 @@ def test_robots_are_listed_and_others_refused(capsys, tmp_path):
     assert main(given) == 2
     assert "no robot 'r2d2'" in (said := capsys.readouterr().err)
     assert "Did you mean" in said
+
+
+def test_a_stopped_command_leaves_nothing_and_is_repeated(monkeypatch, episode, tmp_path):
+    monkeypatch.setattr("egosim_jax.robots.arms.arm_of", lambda _: TOY)
+    monkeypatch.setattr("egosim_jax.robots.models.load_model", lambda _: make_toy())
+    episode.save(tmp_path / "episode")
+    given = ["robot", "render", str(tmp_path / "episode"), "--robot", "toy"]
+    given += ["--out", str(tmp_path / "out")]
+    with monkeypatch.context() as patch:
+        patch.setattr("egosim_jax.io.run.write_json", _interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            Render(source=tmp_path / "episode", robot="toy", out=tmp_path / "out").run()
+    assert [path.name for path in tmp_path.iterdir()] == ["episode"]
+    assert main(given) == 0
+    names = {"robot.mp4", "sheet.jpg", "report.json", "lerobot", "triplets"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == names
+
+
+def _interrupt(*_):
+    raise KeyboardInterrupt
 
 
 def test_a_missing_extra_is_named(monkeypatch, capsys, episode, tmp_path):

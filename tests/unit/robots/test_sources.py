@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -9,10 +10,12 @@ import pytest
 pytest.importorskip("mink")
 
 from egosim_jax.annotate.clip import ANNOTATION, MASKS, read_masks, write_masks
+from egosim_jax.data.readers.lerobot import rate_of, read_info
 from egosim_jax.interactive.options import Limits
 from egosim_jax.interactive.server.store import Store
+from egosim_jax.io.video import read_video
 from egosim_jax.io.writing import write_video
-from egosim_jax.robots.conversion import convert
+from egosim_jax.robots.conversion import convert, export
 from egosim_jax.robots.sources import open_source
 from egosim_jax.simulation.rollout import load_clip
 from egosim_jax.state import snapshot
@@ -48,6 +51,21 @@ def test_an_annotated_clip_has_its_masks_and_what_perception_finds(tmp_path):
     assert (source.kind, source.episode.shape, source.episode.fps) == (
         "annotated clip", (9, 48, 80), 16,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("rate", [Fraction(25, 2), Fraction(15, 2), Fraction(122, 5)])
+def test_a_fractional_rate_is_kept_with_every_frame(tmp_path, rate):
+    """Rounded, 12.5 frames a second lose a frame, and 7.5 repeat one."""
+    video = write(tmp_path / "cup.mp4", textured_video(13), rate)
+    annotate([video], tmp_path / "out", replace(config(), renderer="numpy"))
+    source = open_source(tmp_path / "out/cup")
+    recorded = read_video(tmp_path / "out/cup/video.mp4").frames
+    assert np.array_equal(source.episode.ground_truth[0].frames, recorded)
+    assert source.rate == rate
+    converted = convert(source, make_toy())
+    assert converted.fps == rate
+    export(converted, tmp_path / "set")
+    assert rate_of(read_info(tmp_path / "set", ["v3.0"])) == rate
 
 
 def test_masks_of_a_long_clip_are_read(tmp_path):
