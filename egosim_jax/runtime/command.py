@@ -132,6 +132,7 @@ def main(
         if given == ["--version"]:
             print(f"{program} {metadata.version('egosim-jax')}")
             return ExitCode.DONE
+        _refuse_undecoded(given)
         about = f"{description} --version prints the version."
         command = parse(commands, given, program=program, about=about, others=others)
         _refuse_empty(command)
@@ -143,6 +144,18 @@ def main(
         return code
 
     return run_with_exit_codes(run)
+
+
+def _refuse_undecoded(given: Sequence[str]) -> None:
+    """Raise `InputError` for an argument that is not text: no report could name such a path."""
+    for argument in given:
+        try:
+            argument.encode()
+        except UnicodeEncodeError as error:
+            raise InputError(
+                f"{printable(argument)} is not valid UTF-8: the files that commands write could "
+                "not name it. Rename it, for instance by `convmv -f latin1 -t utf8 --notest PATH`."
+            ) from error
 
 
 def _refuse_empty(command: Any) -> None:

@@ -199,6 +199,16 @@ def test_a_file_as_out_is_refused_before_any_work(program, args, tmp_path, monke
     assert [path.name for path in tmp_path.iterdir()] == ["README.md"]
 
 
+@pytest.mark.parametrize("words", [["data", "pack", "--metadata"], ["view"], ["episode", "make"]])
+def test_a_path_that_is_not_utf8_is_refused_with_a_way_to_rename_it(words, capsys):
+    path = os.fsdecode(b"caf\xe9/metadata.csv")
+    assert egosim([*words, path]) == 2
+    error = capsys.readouterr().err
+    assert "caf\\udce9/metadata.csv" in error
+    assert "convmv" in error
+    assert "Traceback" not in error
+
+
 def test_a_command_that_writes_a_file_replaces_one(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("sheet.png").touch()
