@@ -31,6 +31,7 @@ CONFIG = ModelConfig(
     image=CLIPVisionConfig(image_size=56, dim=64, layers=3, heads=2, ffn_dim=128),
     tokenizer=PromptTokenizer(kind="byt5", max_tokens=96),
     point_px=1,
+    prior="predicted",
     encoders="joint",
     process=RectifiedFlow(shift=3.0),
     steps=2,
