@@ -17,7 +17,7 @@ from egosim_jax.worlds.tabletop import start_of_sequence
 from tests.browser import browse, playing
 
 SEED = 1
-"""A scene whose red object the small model keeps on its way; in scene 0 it breaks up."""
+"""A scene in which the hand is offered a red object."""
 VIDEO = VideoSpec(frames=17, height=96, width=160, fps=8)
 AROUND_PX = 9
 """Half the size of the window around an object, in pixels of the clip."""
