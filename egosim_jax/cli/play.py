@@ -71,12 +71,12 @@ class Play:
             from egosim_jax.simulation.episode import Episode
 
         share_with_jax()
-        given = None if self.episode is None else Episode.load(self.episode)
-        loaded = load_backend(**vars(self.clips), default=MODEL, episode=given)
+        episode = None if self.episode is None else Episode.load(self.episode)
+        loaded = load_backend(**vars(self.clips), default=MODEL, episode=episode)
         world = cast("GeneratedWorld", loaded)
         spec = ActionSpec(sides=(self.hand,), camera=True)
         with phase("makes the scene"):
-            start = self._start(world, spec, given)
+            start = self._start(world, spec, episode)
         if note := world.note(start):
             print(note, file=sys.stderr, flush=True)
 

@@ -410,5 +410,5 @@ def _print(report: Sequence[Mapping[str, Any]], *, name: str) -> None:
         }
         for line in report
     }
-    made = f"{name}s, not clips of a model; " if name == preview.NAME else ""
-    print_table("clip", rows, shown, caption=f"{made}report.json defines these measures")
+    warning = f"{name}s, not clips of a model; " if name == preview.NAME else ""
+    print_table("clip", rows, shown, caption=f"{warning}report.json defines these measures")
