@@ -210,10 +210,10 @@ def test_a_pipe_is_refused_without_waiting_for_it(tmp_path):
 def test_a_hundred_thousand_missing_files_are_refused_at_once(write):
     items = read_metadata(write("video,ego_prior_video,prompt", "v.mp4,p.mp4,x"))
     many = [dataclasses.replace(items[0], video_id=str(n)) for n in range(1000)] * 100
-    then = time.process_time()
+    then = time.thread_time()
     with pytest.raises(InputError, match=r"None of the 100,000 clips has its prior video: .*, …"):
         check_presence(many)
-    assert time.process_time() - then < 5
+    assert time.thread_time() - then < 5
 
 
 def test_only_the_first_of_many_problems_are_listed(write):

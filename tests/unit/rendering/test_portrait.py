@@ -40,9 +40,9 @@ def state_of(points):
 @pytest.mark.parametrize("name", CLOUDS)
 def test_every_cloud_is_drawn_within_seconds(name):
     portrait(state_of(NOISE), up=UP)  # Open3D is imported
-    then = time.process_time()
+    then = time.thread_time()
     images = portrait(state_of(CLOUDS[name]), up=UP)
-    assert time.process_time() - then < 20
+    assert time.thread_time() - then < 20
     drawn = (images > 0).any(axis=-1).sum(axis=(1, 2))
     assert (drawn > 0).all()
     assert (drawn <= len(CLOUDS[name]) * MAX_POINT_PX**2).all()
