@@ -51,7 +51,7 @@ def load_backend(
     perception: str = "classical",
     steps: int | None = None,
     batch: int = 1,
-    compile: bool = True,
+    compile: bool | Literal["behind"] = True,
     update_every: Literal["clip", "chunk"] = "clip",
     default: str = MODEL,
     episode: Episode | None = None,
@@ -61,8 +61,9 @@ def load_backend(
     `config` names a model, or "preview", which needs no weights. Without it the model is `default`,
     and scenes that its weights were not made for get previews, as does all if `episode` is one.
     The model is compiled for all batch sizes now, over all devices. Stderr lists all that is loaded
-    and compiled. Without `compile` it is compiled at the first step. `update_every` updates the
-    state after each clip or, with a causal student, after each chunk of a clip.
+    and compiled. Without `compile` it is compiled at the first step; with "behind" the smallest
+    batch is compiled now, and the others in a thread. `update_every` updates the state after each
+    clip or, with a causal student, after each chunk of a clip.
     """
     if world not in get_args(World):
         raise InputError(f"There is no world {world!r:.40}: it must be 'generated' or 'true'.")
@@ -92,9 +93,9 @@ def load_backend(
     generator = maker.load(mesh=mesh)
     if isinstance(generator, Generator):
         unit = parts("batch", mesh)
-        generator, model = Batcher(generator, max_batch=max(batch, unit), unit=unit), generator
+        generator = Batcher(generator, max_batch=max(batch, unit), unit=unit)
         if compile:
-            model.compile(*generator.sizes, streamed=True)
+            generator.compile(behind=compile == "behind")
     return GeneratedWorld(
         generator=generator,
         video=maker.video,

@@ -1,13 +1,14 @@
 """Batching of clips that many threads request.
 
 Each caller calls the batcher like a generator, in its own thread. The batcher's thread drains the
-queue into the largest compiled batch size it can fill. It pads only to the number of devices.
-Before a batch it waits up to `wait_s` for callers that have announced a clip. The next batch
-gathers while one runs.
+queue into the largest batch size that it can fill and that is compiled. It pads only to the number
+of devices. Before a batch it waits up to `wait_s` for callers that have announced a clip. The next
+batch gathers while one runs.
 """
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -21,6 +22,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from egosim_jax.rendering import PriorKind
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.simulation.streams import ClipStream, VideoGenerator, WholeClip
 from egosim_jax.types import Action, InputError, Triplet, View, check_counts, check_seed
 
@@ -88,6 +90,39 @@ class Batcher:
         """Number of runs by batch size."""
         self._thread = threading.Thread(target=self._work, name="batcher", daemon=True)
         self._thread.start()
+
+    def compile(self, *, behind: bool = False) -> None:
+        """Compile the generator for all batch sizes.
+
+        With `behind` only the smallest is compiled now, and the others in a thread: until one is
+        ready, smaller batches take its clips.
+        """
+        if not behind:
+            self._generator.compile(*self.sizes, streamed=True)
+            return
+        first, *larger = self.sizes
+        self._generator.compile(first, streamed=True)
+        self.sizes = [first]
+        compiler = threading.Thread(target=self._add, args=(larger,), name="compiler", daemon=True)
+        compiler.start()
+
+    def _add(self, sizes: list[int]) -> None:
+        """Compile further batch sizes, and take each as soon as it is compiled."""
+        for size in sizes:
+            if self._closed:
+                return
+            try:
+                self._generator.compile(size, streamed=True)
+            except Exception as error:  # such as too little memory of the device
+                print(
+                    f"batches of {size} clips cannot be compiled, so at most {self.sizes[-1]} are "
+                    f"generated at once: {printable(error)}",
+                    file=sys.stderr,
+                    flush=True,
+                )
+                return
+            with self._changed:
+                self.sizes = [*self.sizes, size]
 
     @cached_property
     def _fingerprint(self) -> str:

@@ -10,6 +10,7 @@ with Client("ws://127.0.0.1:8000") as client:
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -37,23 +38,16 @@ class Client:
         token: str | None = None,
         timeout_s: float = 600.0,
         patience_s: float = 600.0,
+        wait: float = 0.0,
     ):
         """Connect to an address such as ws://127.0.0.1:8000.
 
-        A request waits `timeout_s` for its reply. While the server is full or the session busy, it
-        is sent again for up to `patience_s`.
+        A server that has not started yet is tried again for up to `wait` seconds. A request waits
+        `timeout_s` for its reply. While the server is full or the session busy, it is sent again
+        for up to `patience_s`.
         """
-        import websockets.sync.client
-
         self._timeout_s, self._patience_s = timeout_s, patience_s
-        headers = {"Authorization": f"Bearer {token}"} if token else None
-        self._connection = websockets.sync.client.connect(
-            address.replace("http", "ws", 1) if address.startswith("http") else address,
-            compression=None,
-            max_size=None,
-            additional_headers=headers,
-            ping_timeout=None,
-        )
+        self._connection = _connect(address, token, wait_s=wait)
         self._socket = self._connection.__enter__()
         self.server: dict[str, Any] = wire.unpack(self._received())
         """Description of the server: world, size and rate of its clips, limits."""
@@ -121,6 +115,29 @@ class Client:
         """Continue a session of any client, by its id."""
         status = self.request("status", session=session)
         return RemoteSession(self, {**status, "step_id": status["committed_step_id"]})
+
+
+def _connect(address: str, token: str | None, *, wait_s: float) -> Any:
+    """Return the connection to a server, which may start meanwhile."""
+    import websockets.sync.client
+
+    until, told = time.monotonic() + wait_s, False
+    while True:
+        try:
+            return websockets.sync.client.connect(
+                address.replace("http", "ws", 1) if address.startswith("http") else address,
+                compression=None,
+                max_size=None,
+                additional_headers={"Authorization": f"Bearer {token}"} if token else None,
+                ping_timeout=None,
+            )
+        except ConnectionRefusedError:  # nothing listens at the address yet
+            if time.monotonic() >= until:
+                raise
+        if not told:
+            told = True
+            print(f"waits up to {wait_s:g} s for {address} to start", file=sys.stderr, flush=True)
+        time.sleep(min(0.5, max(0.0, until - time.monotonic())))
 
 
 class RemoteSession:

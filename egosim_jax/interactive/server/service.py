@@ -253,11 +253,11 @@ class Service(Requests):
 def open_service(folder: Path, limits: Limits, world: World, **options: Any) -> Service:
     """Load and compile a world, resume the sessions of a folder, and return the service.
 
-    `load_backend` has the same options.
+    Larger batches are compiled while it serves. `load_backend` has the same options.
     """
     share_with_jax()
     return_freed_blocks()
-    backend = load_backend(world, **options)
+    backend = load_backend(world, compile="behind", **options)
     store = Store(folder, backend, limits)
     print(f"resumed {len(store.sessions)} sessions", file=sys.stderr)
     return Service(store, world=backend.identity()["world"])

@@ -27,6 +27,15 @@ class Counting:
     def __init__(self):
         self.batches, self.held = [], threading.Event()
         self.held.set()
+        self.compiled, self.compiling = [], threading.Semaphore(0)
+
+    def compile(self, *sizes, streamed):
+        assert streamed
+        for size in sizes:
+            self.compiling.acquire(timeout=30)
+            if size == 8:
+                raise MemoryError("8 clips do not fit")
+            self.compiled.append(size)
 
     def condition(self, view, action, first_frame):
         return action
@@ -49,6 +58,13 @@ class Counting:
         raise AssertionError
 
     begin = __call__
+
+
+def wait_until(done):
+    until = time.monotonic() + 30
+    while not done():
+        assert time.monotonic() < until
+        time.sleep(0.01)
 
 
 @functools.cache
@@ -102,6 +118,32 @@ def test_the_largest_program_that_is_filled_runs(generator, make_batcher):
         generator.held.set()
     first.join()
     assert [len(batch) for batch in generator.batches] == [1, 4, 2, 1]
+
+
+def test_a_larger_batch_is_taken_as_soon_as_it_is_compiled(generator, make_batcher, capsys):
+    batcher = make_batcher(max_batch=8, wait_s=0.0)
+
+    def largest():
+        """Return the largest batch of five clips, of which four wait while one is generated."""
+        generator.held.clear()
+        with ThreadPoolExecutor(5) as threads:
+            asked = [threads.submit(ask, batcher, seed) for seed in range(5)]
+            wait_until(lambda: len(batcher._waiting) >= 4)
+            generator.held.set()
+        assert [clip.result() for clip in asked] == [0, 1, 2, 3, 4]
+        return max(len(batch) for batch in generator.batches)
+
+    generator.compiling.release()
+    batcher.compile(behind=True)
+    assert generator.compiled == [1]
+    assert largest() == 1
+    generator.compiling.release()
+    wait_until(lambda: batcher.sizes == [1, 2])
+    assert largest() == 2
+    generator.compiling.release(2)
+    wait_until(lambda: all(thread.name != "compiler" for thread in threading.enumerate()))
+    assert "at most 4 are generated at once" in capsys.readouterr().err
+    assert generator.compiled == batcher.sizes == [1, 2, 4]
 
 
 def test_a_batch_is_padded_to_the_devices_only(generator, make_batcher):

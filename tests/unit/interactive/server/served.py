@@ -17,7 +17,7 @@ from tests.painted import painted
 TOKEN = "secret"  # noqa: S105
 
 
-def run(folder, token=None, limits=None, world=None):
+def run(folder, token=None, limits=None, world=None, bound=None):
     """A service, its port, and the thread that serves it."""
     store = Store(folder, world or painted(), limits or Limits())
     service = Service(store, world="painted")
@@ -27,8 +27,9 @@ def run(folder, token=None, limits=None, world=None):
         ports.append(port)
         ready.set()
 
-    args, options = (service, bind("127.0.0.1", 0, token=token)), {"token": token, "ready": note}
-    thread = threading.Thread(target=serve, args=args, kwargs=options, daemon=True)
+    bound = bound or bind("127.0.0.1", 0, token=token)
+    options = {"token": token, "ready": note}
+    thread = threading.Thread(target=serve, args=(service, bound), kwargs=options, daemon=True)
     thread.start()
     assert ready.wait(30)
     return service, ports[0], thread

@@ -2,6 +2,7 @@
 
 import json
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -15,6 +16,21 @@ from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.types import InputError
 from tests.painted import VIDEO, PaintedWorld, Painter
 from tests.unit.interactive.server.served import http, run
+
+
+def test_a_client_waits_for_a_server_that_starts(tmp_path):
+    bound = bind("127.0.0.1", 0, token=None)
+    address = f"ws://127.0.0.1:{bound.getsockname()[1]}"
+    with pytest.raises(ConnectionRefusedError):
+        Client(address)
+    with ThreadPoolExecutor(1) as threads:
+        waiting = threads.submit(Client, address, wait=60.0)
+        time.sleep(0.5)
+        assert not waiting.done()
+        service, _, _ = run(tmp_path, bound=bound)
+        with waiting.result(60) as client:
+            assert client.server["world"] == "painted"
+    service.store.close()
 
 
 def test_two_clients_step_their_sessions_and_one_continues_the_others(server):
