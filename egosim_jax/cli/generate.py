@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from egosim_jax.data.clip_files import Prompts
 from egosim_jax.runtime import interrupts
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.runtime.phases import phase
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import InputError, MeshConfig, check_counts, check_seed
 
 if TYPE_CHECKING:
@@ -63,7 +65,8 @@ class Generate:
     lora: Path | None = None
     """LoRA of the video transformer, with PEFT, diffusers, kohya or ComfyUI names.
 
-    A file, or DWM's folder of a LoRA and fully trained weights."""
+    A file, or DWM's folder of a LoRA and fully trained weights. LightX2V's four-step LoRAs of Wan
+    2.1 set steps, guidance and solver."""
     lora_scale: float | None = None
     """Strength of the LoRA."""
     video_id: tuple[str, ...] = ()
@@ -93,7 +96,8 @@ class Generate:
     """Solver, instead of the model's: a name, or MODULE:NAME of your own, with its options.
 
     euler; unipc; wan: UniPC with Wan's noise levels and integer timesteps; ddim; dpmpp_2m:
-    DPM-Solver++ (2M); dpmpp_2m_sde: its SDE form, which adds noise at each step."""
+    DPM-Solver++ (2M); dpmpp_2m_sde: its SDE form, which adds noise at each step; renoise: new noise
+    at each step, for distilled networks."""
     guidance: float | None = None
     """Scale of the guidance on the text, instead of the model's; 1: none, half the time."""
     guidance_interval: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="LOW HIGH")] = (
@@ -218,10 +222,18 @@ class Generate:
         from egosim_jax import configs
         from egosim_jax.diffusion import SOLVERS, Guidance, RectifiedFlow, StepCache
         from egosim_jax.generation.batch import STRENGTH
+        from egosim_jax.generation.distilled import distilled, is_distilled
 
         config = configs.get(self.config)
         config = config if self.sampling is None else configs.sampled(config, self.sampling)
         config = config if self._weights is None else config.at(self._weights)
+        if self.lora is not None and is_distilled(self.lora) and self.sampling is None:
+            config = distilled(config)
+            print(
+                f"{printable(self.lora.name)} is distilled: {config.steps} steps without guidance, "
+                "unless --steps, --guidance or --solver say otherwise",
+                file=sys.stderr,
+            )
         strength = self.strength
         if self.baseline == "sdedit" and strength is None:
             strength = STRENGTH

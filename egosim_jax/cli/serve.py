@@ -61,6 +61,7 @@ class Serve:
             )
         check_counts({"--batch": self.batch})
         with phase("loads JAX and the server"):
+            from egosim_jax.interactive.env.batching import is_compiling
             from egosim_jax.interactive.server.server import serve
 
         token = os.environ.get(TOKEN, "").strip() or None
@@ -71,6 +72,10 @@ class Serve:
                 finished = serve(service, bound, token=token, ready=self._ready)
             finally:
                 service.store.close(at_once=not finished)
+        if is_compiling():  # XLA's compiler aborts when the interpreter ends around it
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(ExitCode.DONE)
         return ExitCode.DONE
 
     def _service(self) -> Service:

@@ -3,7 +3,7 @@
 Pure functions of arrays and a predicting function belong here. Networks do not.
 
     RectifiedFlow, VariancePreserving       processes
-    Euler, DDIM, UniPC, DPMSolver           solvers
+    Euler, DDIM, Renoise, UniPC, DPMSolver  solvers
     SOLVERS                                 solvers by name, also of other packages
     integrate                               the sampling loop, one scan
     StepCache                               steps that reuse predictions
@@ -22,7 +22,7 @@ from egosim_jax.diffusion.process import (
     RectifiedFlow,
     VariancePreserving,
 )
-from egosim_jax.diffusion.solver import DDIM, SOLVERS, Euler, Solver, integrate
+from egosim_jax.diffusion.solver import DDIM, SOLVERS, Euler, Renoise, Solver, integrate
 from egosim_jax.diffusion.unipc import UniPC
 
 __all__ = [
@@ -36,6 +36,7 @@ __all__ = [
     "Prediction",
     "Process",
     "RectifiedFlow",
+    "Renoise",
     "Solver",
     "StepCache",
     "UniPC",

@@ -85,6 +85,7 @@ SOLVERS: Registry[Solver] = Registry(
         "unipc": "egosim_jax.diffusion:UniPC",
         "wan": "egosim_jax.diffusion:UniPC",
         "ddim": "egosim_jax.diffusion:DDIM",
+        "renoise": "egosim_jax.diffusion:Renoise",
         "dpmpp_2m": "egosim_jax.diffusion:DPMSolver",
         "dpmpp_2m_sde": "egosim_jax.diffusion.dpm:SDE",
     },
@@ -316,7 +317,7 @@ class DDIM:
         """Return the factors of data and noise of each step."""
         alpha, sigma = process.alpha(times), process.sigma(times)
         ratio = alpha[:-1] * sigma[1:] / (sigma[:-1] * alpha[1:])  # e^-h
-        new = self.eta**2 * (1 - ratio**2)  # share of the variance
+        new = self._new_share(ratio)
         columns = (
             alpha[:-1],
             sigma[:-1],
@@ -325,6 +326,10 @@ class DDIM:
             sigma[1:] * np.sqrt(new),
         )
         return DDIMRow(*columns)
+
+    def _new_share(self, ratio: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Return the share of the variance that is new, of steps with these ratios e^-h."""
+        return self.eta**2 * (1 - ratio**2)
 
     def start(self, x: Float[Array, "*x"]) -> DDIMState:
         """Return the noise as the first latents."""
@@ -344,3 +349,18 @@ class DDIM:
         epsilon = process.to_epsilon(state.x, output, row.alpha, row.sigma)
         x = row.data * data + row.epsilon * epsilon
         return DDIMState(x if keys is None else x + row.noise * sample_noise(keys, x))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Renoise(DDIM):
+    """DDIM that replaces all noise at each step: the sampler of step-distilled networks.
+
+    Such a network predicts the data at once; the next step begins from that data with new noise
+    (Song et al. 2023, multistep consistency sampling; LightX2V's four steps of Wan).
+    """
+
+    eta: float = 1.0
+    """At least the ancestral sampler's noise."""
+
+    def _new_share(self, ratio: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        return np.ones_like(ratio)

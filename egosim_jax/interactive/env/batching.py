@@ -26,6 +26,9 @@ from egosim_jax.runtime.terminal import printable
 from egosim_jax.simulation.streams import ClipStream, VideoGenerator, WholeClip
 from egosim_jax.types import Action, InputError, Triplet, View, check_counts, check_seed
 
+COMPILER = "compiler"
+"""Name of the thread that compiles for larger batches."""
+
 
 @no_type_check
 @dataclass(eq=False, kw_only=True)
@@ -103,8 +106,7 @@ class Batcher:
         first, *larger = self.sizes
         self._generator.compile(first, streamed=True)
         self.sizes = [first]
-        compiler = threading.Thread(target=self._add, args=(larger,), name="compiler", daemon=True)
-        compiler.start()
+        threading.Thread(target=self._add, args=(larger,), name=COMPILER, daemon=True).start()
 
     def _add(self, sizes: list[int]) -> None:
         """Compile further batch sizes, and take each as soon as it is compiled."""
@@ -235,3 +237,8 @@ class Batcher:
 def announced(generator: VideoGenerator) -> AbstractContextManager[None]:
     """Return the context in which a thread requests a clip; only a `Batcher` counts it."""
     return generator.announced() if isinstance(generator, Batcher) else nullcontext()
+
+
+def is_compiling() -> bool:
+    """Return True while a thread compiles for larger batches; Python cannot end it."""
+    return any(thread.name == COMPILER for thread in threading.enumerate())

@@ -8,7 +8,9 @@ from safetensors.numpy import save_file
 
 from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
+from egosim_jax.cli.generate import Generate
 from egosim_jax.data.clips import write_clips
+from egosim_jax.diffusion import Guidance, Renoise
 from egosim_jax.generation.batch import BatchJob
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.types import InputError, VideoSpec
@@ -87,3 +89,27 @@ def test_an_option_without_its_values_is_refused(args, name, capsys):
         code = error.code
     assert code == ExitCode.USAGE
     assert name in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "recognized"),
+    [
+        ("wan2.1_i2v_lora_rank64_lightx2v_4step.safetensors", True),
+        ("Wan21_I2V_14B_lightx2v_cfg_step_distill_lora_rank64.safetensors", True),
+        ("lightx2v_I2V_14B_480p_cfg_step_distill_rank16_bf16.safetensors", True),
+        ("wan2.2_i2v_lightx2v_4steps_lora_v1_high_noise.safetensors", False),
+        ("my_kitchen_lora.safetensors", False),
+    ],
+)
+def test_a_step_distilled_lora_brings_its_sampler(name, recognized, tmp_path, capsys):
+    plain = configs.get("egosim_14b")
+    (tmp_path / "dit.safetensors").touch()
+    command = Generate(config="egosim_14b", weights=tmp_path, lora=tmp_path / name)
+    model = command._model()
+    shift = replace(plain.process, shift=5.0)
+    sampler = (4, Renoise(), Guidance(), shift)
+    usual = (plain.steps, plain.solver, plain.guidance, plain.process)
+    got = (model.steps, model.solver, model.guidance, model.process)
+    assert got == (sampler if recognized else usual)
+    assert ("is distilled: 4 steps" in capsys.readouterr().err) == recognized
+    assert replace(command, steps=8)._model().steps == 8

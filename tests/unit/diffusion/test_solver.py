@@ -1,5 +1,7 @@
 """Solvers on equations with known solutions; `tests/parity` compares them with diffusers."""
 
+from itertools import pairwise
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,7 @@ from egosim_jax.diffusion import (
     DPMSolver,
     Euler,
     RectifiedFlow,
+    Renoise,
     UniPC,
     VariancePreserving,
     integrate,
@@ -20,7 +23,7 @@ from egosim_jax.types import InputError
 
 PROCESS = RectifiedFlow(shift=2.0)
 DETERMINISTIC = [Euler(), UniPC(order=1), UniPC(order=2), UniPC(order=3), DDIM(), DPMSolver()]
-STOCHASTIC = [DDIM(eta=1.0), DPMSolver(stochastic=True)]
+STOCHASTIC = [DDIM(eta=1.0), Renoise(), DPMSolver(stochastic=True)]
 
 
 def test_solvers_have_the_names_of_other_programs():
@@ -29,6 +32,7 @@ def test_solvers_have_the_names_of_other_programs():
         "unipc": UniPC(),
         "wan": UniPC(),
         "ddim": DDIM(),
+        "renoise": Renoise(),
         "dpmpp_2m": DPMSolver(),
         "dpmpp_2m_sde": DPMSolver(stochastic=True),
     }
@@ -294,3 +298,15 @@ def test_a_solver_ends_alike_whatever_the_network_predicts(noise, solver, predic
     expected = integrate(data, noise, process=reference, solver=solver, steps=10)
     # epsilon is divided by alpha = 0.07 at the start.
     np.testing.assert_allclose(x, expected, atol=2e-5)
+
+
+def test_renoise_begins_each_step_from_the_data_with_new_noise(noise):
+    process, keys = RectifiedFlow(shift=5.0), jax.random.split(jax.random.key(1), 2)
+    got = integrate(gaussian_velocity, noise, process=process, solver=Renoise(), steps=4, keys=keys)
+    x = noise
+    levels = [5 * u / (1 + 4 * u) for u in (1, 0.75, 0.5, 0.25, 0)]
+    for step, (level, following) in enumerate(pairwise(levels)):
+        data = x - level * gaussian_velocity(x, jnp.full(2, 1000 * level))
+        new = [jax.random.normal(jax.random.fold_in(key, step), x.shape[1:]) for key in keys]
+        x = (1 - following) * data + following * jnp.stack(new)
+    np.testing.assert_allclose(got, x, rtol=1e-5, atol=1e-5)

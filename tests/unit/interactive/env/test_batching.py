@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
-from egosim_jax.interactive.env.batching import Batcher
+from egosim_jax.interactive.env.batching import Batcher, is_compiling
 from egosim_jax.rendering import reference
 from egosim_jax.types import InputError
 from tests.painted import painted
@@ -141,7 +141,7 @@ def test_a_larger_batch_is_taken_as_soon_as_it_is_compiled(generator, make_batch
     wait_until(lambda: batcher.sizes == [1, 2])
     assert largest() == 2
     generator.compiling.release(2)
-    wait_until(lambda: all(thread.name != "compiler" for thread in threading.enumerate()))
+    wait_until(lambda: not is_compiling())
     assert "at most 4 are generated at once" in capsys.readouterr().err
     assert generator.compiled == batcher.sizes == [1, 2, 4]
 
