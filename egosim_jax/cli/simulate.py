@@ -315,7 +315,7 @@ class _Outputs:
                 self._write_state(0, state)
                 if find_spec("rerun"):
                     recording = Recording(folder / RECORDING, folder.name, up=self.up)
-            moved = moved_objects(state, step.state)
+            moved = moved_objects(state, step.state, step.notes)
             with phase(f"clip {self.number}: scores and draws", only_if_long=True):
                 report.append(
                     {
