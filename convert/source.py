@@ -92,7 +92,7 @@ def sources(path: Path) -> Iterator[Source]:
 def _numbered(file: Path) -> tuple[str, list[Path]]:
     """Return the name and the files of the checkpoint that a numbered file names, or of the file.
 
-    A numbered file of which others are missing is read alone.
+    A numbered file is read alone if others of its checkpoint are missing.
     """
     if part := SHARD.fullmatch(file.stem):
         count = int(part[2])

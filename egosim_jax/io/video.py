@@ -51,7 +51,7 @@ VIDEO_SUFFIXES = (
     ".mp4", ".m4v", ".mov", ".qt", ".3gp", ".mkv", ".webm", ".avi", ".ts", ".mts", ".m2ts",
     ".mpg", ".mpeg", ".wmv", ".flv", ".ogv",
 )  # fmt: skip
-"""Suffixes of the files that are taken for videos; those of the last line are refused by name."""
+"""Suffixes of the files that are taken for videos; files of the last line are refused by name."""
 MAX_KEPT = 3 * 2**28
 """Maximum size of the frames that one call returns, in bytes."""
 Each = Callable[[np.ndarray], np.ndarray]

@@ -1,4 +1,4 @@
-"""Commands with stand-ins for what they would download: hands of a network, models of robots.
+"""Commands with substitutes for what they would download: hands of a network, models of robots.
 
 python -m tests.crash.commands COMMAND ...     as `egosim COMMAND ...`
 python -m tests.crash.commands --make NAME     an input of the commands, in the current folder

@@ -154,7 +154,8 @@ class AgiBot:
             None if matrices is None else matrices[rows], tools[rows], lens
         )
         if "unknown" in decision["extrinsics"]:
-            logger.warning("%s: poses and grippers are %s", files.camera, decision["extrinsics"])
+            where = quote_path(files.camera)
+            logger.warning("%s: poses and grippers are %s", where, decision["extrinsics"])
         remap = None if lens is None or lens.is_pinhole() else Remap.of(lens)
         intrinsics = None if lens is None else (remap or lens).intrinsics_px
         cameras = None if poses is None or intrinsics is None else Cameras(
@@ -206,10 +207,10 @@ class AgiBot:
             "camera_to_base": matrices, "base_to_camera": invert(matrices),
         }  # fmt: skip
         chosen = self.extrinsics
-        if lens is None and chosen is None:
-            why = "unknown: no intrinsics to decide their reading by; choose it (--extrinsics)"
-            return None, {"extrinsics": why}
         if lens is None:
+            if chosen is None:
+                why = "unknown: no intrinsics to decide their reading by; choose it (--extrinsics)"
+                return None, {"extrinsics": why}
             return readings[chosen], {"extrinsics": chosen, "extrinsics_by": "user"}
         shares = {name: share_in_view(poses, tools, lens) for name, poses in readings.items()}
         best, other = sorted(readings, key=lambda name: -shares[name])

@@ -113,14 +113,14 @@ def _read(path: Path, folder: Path) -> Recording:
         numbered = {int(match[1]): match[0] for match in matches}  # rgbd/ rather than rgb/
         count = max(numbered, default=-1) + 1
         poses = _poses(metadata, path)
-        given = count if poses is None else len(poses)
-        if not 0 < count <= given:
+        posed = count if poses is None else len(poses)
+        if not 0 < count <= posed:
             raise InputError(
-                f"{quote_path(path)} has {len(numbered)} images and {given} poses: the images must "
+                f"{quote_path(path)} has {len(numbered)} images and {posed} poses: the images must "
                 "be numbered from 0, one per pose. Export the capture again."
             )
-        lens, spread = _lens(metadata, given, path)
-        rigid = np.ones(given, bool) if poses is None else is_rigid(poses)
+        lens, spread = _lens(metadata, posed, path)
+        rigid = np.ones(posed, bool) if poses is None else is_rigid(poses)
         numbers = sorted(numbered)[:MAX_IMAGES]
         used = dict(zip((numbered[number] for number in numbers), rigid[numbers], strict=True))
         run = longest_run(list(used), used.__getitem__)

@@ -58,7 +58,7 @@ def test_numbered_files_and_files_of_an_index_are_one_checkpoint(tmp_path):
 
 
 @pytest.mark.parametrize("indexed", [False, True])
-def test_files_beside_a_single_one_are_chosen_by_the_path_in_the_refusal(tmp_path, indexed):
+def test_files_next_to_a_single_one_are_chosen_by_the_path_in_the_refusal(tmp_path, indexed):
     save_file({"visual.cls_embedding": torch.rand(1)}, tmp_path / "model.safetensors")
     names = ["visual.cls_embedding", "other"]
     files = [f"x-{number:05d}-of-00002.safetensors" for number in (1, 2)]
