@@ -26,6 +26,8 @@ WRAPPER = re.compile(r"(^|(?<=\.))(_orig_mod|_fsdp_wrapped_module|_checkpoint_wr
 TOKENIZER_FILES = (
     "tokenizer.json", "spiece.model", "tokenizer_config.json", "special_tokens_map.json",
 )  # fmt: skip
+MAX_FILES = 1000
+"""Maximum number of the files of a checkpoint that one of them names."""
 MAX_TOKENIZER = 64 << 20
 """Maximum size of a tokenizer file in bytes."""
 
@@ -43,11 +45,11 @@ class Source:
 
     @property
     def path(self) -> Path:
-        """Path of this checkpoint alone: its file, its index, or the folder of its files."""
+        """Path of this checkpoint alone: its file, its index, or the first of its files."""
         if len(self.files) == 1:
             return self.files[0]
         index = self.files[0].with_name(f"{self.name}{INDEX}")
-        return index if index.exists() else self.files[0].parent
+        return index if index.exists() else self.files[0]
 
     @property
     def bytes(self) -> int:
@@ -58,14 +60,15 @@ class Source:
 def sources(path: Path) -> Iterator[Source]:
     """Yield the checkpoints of a file, an index or a folder; subfolders are not searched.
 
-    Files of one index, or numbered `NAME-00001-of-00003`, are one checkpoint. Raises `InputError`
-    if a file is damaged or missing, or if two files of a checkpoint have the same tensor.
+    Files of one index, or numbered `NAME-00001-of-00003`, are one checkpoint; any of the numbered
+    ones names it, if all are there. Raises `InputError` if a file is damaged or missing, or if two
+    files of a checkpoint have the same tensor.
     """
     if path.name.endswith(INDEX):
         yield _of_index(path)
         return
     if not path.is_dir():
-        yield _joined(quote_path(path.name), [path])
+        yield _joined(*_numbered(path))
         return
     left = {f for f in path.iterdir() if f.suffix in (".safetensors", *PTH) and f.is_file()}
     left = {file for file in left if not file.name.startswith(".")}  # incomplete files
@@ -84,6 +87,22 @@ def sources(path: Path) -> Iterator[Source]:
                 f"{quote_path(path)} has {len(files)} of the {int(part[2])} files of {name}."
             )
         yield _joined(name, files)
+
+
+def _numbered(file: Path) -> tuple[str, list[Path]]:
+    """Return the name and the files of the checkpoint that a numbered file names, or of the file.
+
+    A numbered file is read alone if others of its checkpoint are missing.
+    """
+    if part := SHARD.fullmatch(file.stem):
+        count = int(part[2])
+        files = [
+            file.with_name(f"{part[1]}-{number:05d}-of-{part[2]}{file.suffix}")
+            for number in range(1, min(count, MAX_FILES) + 1)
+        ]
+        if file in files and len(files) == count and all(map(Path.is_file, files)):
+            return quote_path(part[1]), files
+    return quote_path(file.name), [file]
 
 
 def _of_index(index: Path) -> Source:

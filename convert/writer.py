@@ -37,6 +37,7 @@ from egosim_jax.io.mapped import (
 )
 from egosim_jax.io.run import write_json
 from egosim_jax.runtime.progress import track_bytes
+from egosim_jax.runtime.terminal import print_line
 from egosim_jax.runtime.threads import map_ahead
 from egosim_jax.types import InputError
 
@@ -229,7 +230,7 @@ def write_file(
     pieces = write(target, weights, origin=origin, metadata=metadata, settings=settings)
     for _ in track_bytes(pieces, f"writing {target.name}", total=total):
         pass
-    print(quote_path(target))
+    print_line(target)
 
 
 def write_sharded(

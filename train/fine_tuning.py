@@ -12,6 +12,7 @@ from egosim_jax.models.attention import Kernel
 from egosim_jax.models.chunks import Chunks
 from egosim_jax.models.layers import Products
 from egosim_jax.runtime.command import ExitCode, HelpGroups
+from egosim_jax.runtime.terminal import print_line
 from egosim_jax.train.config import TrainConfig
 from egosim_jax.train.recipe import Recipe
 from egosim_jax.train.task import Stage
@@ -148,7 +149,7 @@ class FineTuning(Recipe):
             samples=validation
             and Samples(model=model, latents=validation, vae=weights, count=self.samples),
         )
-        print(write_trained(trained, out, model=model, start=weights, rank=self.rank))
+        print_line(write_trained(trained, out, model=model, start=weights, rank=self.rank))
         return ExitCode.DONE
 
     def check_lora(self, weights: Path) -> tuple[Path, Mapping[str, Change]] | None:

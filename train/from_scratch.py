@@ -20,7 +20,7 @@ from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.models.layers import Products
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.runtime.progress import track
-from egosim_jax.runtime.terminal import printable
+from egosim_jax.runtime.terminal import print_line, printable
 from egosim_jax.train.config import TrainConfig, WeightsDtype, resume_mutable
 from egosim_jax.train.distributed import require_single_process, stop_if_preempted
 from egosim_jax.train.recipe import Recipe
@@ -141,7 +141,7 @@ class FromScratch(Recipe):
         )
         networks.dit, networks.text, networks.image = trained.dit, trained.text, trained.image
         networks.save(out / "weights", dtype=self.weights_dtype)
-        print(out / "weights")
+        print_line(out / "weights")
         return ExitCode.DONE
 
     def _mutable(self, out: Path) -> list[str]:

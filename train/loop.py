@@ -34,6 +34,7 @@ from egosim_jax.models.layers import LowRankParam, init_sharded
 from egosim_jax.models.lora import Change, check_further, state_of
 from egosim_jax.runtime.command import CommandExit, ExitCode
 from egosim_jax.runtime.phases import phase
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.sharding import assemble, batch_sharding, make_mesh, parts, process_rows
 from egosim_jax.train.config import TrainConfig, numerics_only, resume_mutable
 from egosim_jax.train.distributed import (
@@ -368,7 +369,7 @@ def is_first() -> bool:
 def log0(text: str) -> None:
     """Print to stderr, in the first process only."""
     if is_first():
-        print(text, file=sys.stderr, flush=True)
+        print(printable(text), file=sys.stderr, flush=True)
 
 
 def phase0(text: str) -> AbstractContextManager[None]:

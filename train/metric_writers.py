@@ -112,7 +112,7 @@ class WandB:
 
     def __init__(self, folder: Path, *, project: str, name: str):
         wandb = _package("wandb")
-        path = folder / "wandb_id.txt"
+        path, settings = folder / "wandb_id.txt", folder / "config.json"
         if not path.exists():
             write_text(path, secrets.token_hex(4))
         self._run = wandb.init(
@@ -121,7 +121,7 @@ class WandB:
             id=path.read_text("utf-8"),
             resume="allow",
             dir=str(folder),
-            config=read_json(folder / "config.json"),
+            config=read_json(settings) if settings.exists() else None,
         )
 
     def write(self, step: int, values: Mapping[str, float]) -> None:

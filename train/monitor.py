@@ -31,6 +31,7 @@ from egosim_jax.data.shards import ShardReader
 from egosim_jax.generation.generator import denoise
 from egosim_jax.preflight.targets import peak
 from egosim_jax.runtime.command import CommandExit, ExitCode
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.sharding import batch_sharding, parts
 from egosim_jax.train.tasks.denoising import condition_of
 from egosim_jax.train.update import MAX_CONSECUTIVE_SKIPS
@@ -197,7 +198,9 @@ class SkipMonitor:
         who = "" if student else "critic: "
         loss, norm = (float(metrics[f"critic_{m}" if who else m]) for m in ("loss", "grad_norm"))
         print(
-            f"step {step} skipped: {who}loss {loss:.4g}, grad_norm {norm:.4g}, records {names}",
+            printable(
+                f"step {step} skipped: {who}loss {loss:.4g}, grad_norm {norm:.4g}, records {names}"
+            ),
             file=sys.stderr,
             flush=True,
         )

@@ -23,6 +23,7 @@ from egosim_jax.io import weights
 from egosim_jax.io.mapped import read_safetensors
 from egosim_jax.models import VideoCodecConfig, abstract
 from egosim_jax.runtime.command import ExitCode, HelpGroups
+from egosim_jax.runtime.terminal import print_line
 from egosim_jax.train.config import TrainConfig, WeightsDtype, resume_mutable
 from egosim_jax.train.distributed import require_single_process
 from egosim_jax.train.recipe import Recipe
@@ -122,7 +123,7 @@ class RefineVAE(Recipe):
         folder = out / "weights"
         weights.save(folder / "vae.safetensors", vae, dtype=self.weights_dtype)
         weights.add_others(folder, start)
-        print(folder)
+        print_line(folder)
         return ExitCode.DONE
 
 

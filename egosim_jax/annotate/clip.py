@@ -38,7 +38,7 @@ from egosim_jax.io.bounded import quote_path, read_json
 from egosim_jax.io.journal import Journal
 from egosim_jax.io.run import write_json, write_text
 from egosim_jax.io.untrusted.npz import MAX_PACKED_BYTES, read_arrays
-from egosim_jax.runtime.command import system_failure
+from egosim_jax.runtime.failures import system_failure
 from egosim_jax.runtime.phases import phase
 from egosim_jax.state import snapshot
 from egosim_jax.types import InputError

@@ -31,11 +31,12 @@ from egosim_jax.annotate.gallery import write_page
 from egosim_jax.annotate.prepare import scan, windows
 from egosim_jax.annotate.sources import Source, open_source
 from egosim_jax.data.clips import write_table
-from egosim_jax.io.bounded import read_json
+from egosim_jax.io.bounded import quote_path, read_json
 from egosim_jax.io.journal import Journal
 from egosim_jax.io.run import plain, write_json
 from egosim_jax.runtime.command import CommandExit, ExitCode
 from egosim_jax.runtime.processes import run_in_processes
+from egosim_jax.runtime.terminal import check_utf8
 from egosim_jax.types import InputError
 
 T = TypeVar("T")
@@ -92,8 +93,10 @@ def scan_source(source: Source, out: Path, config: AnnotateConfig) -> Scanned:
                 f"{written['bytes']:,} bytes. Choose another folder. (--out)"
             )
         return _scanned(source.name, out, written)
-    about: dict[str, Any] = {"path": str(source.path), "bytes": size, "windows": []}
+    about: dict[str, Any] = {"path": quote_path(source.path), "bytes": size, "windows": []}
     try:
+        check_utf8(source.path)
+        about["path"] = str(source.path)
         recording = open_source(source, config.depth_files, config.depth_unit_m)
         fitted = plan(recording, config.sampling, cut=config.cutting.clips)
         recording.save(_recording_folder(out, source.name))

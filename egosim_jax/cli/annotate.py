@@ -15,7 +15,7 @@ from egosim_jax.perception.video.estimates import ChosenRung
 from egosim_jax.rendering import PriorKind, RendererName
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.runtime.progress import track
-from egosim_jax.runtime.terminal import counted, printable
+from egosim_jax.runtime.terminal import counted, print_line, printable
 from egosim_jax.types import check_counts
 
 if TYPE_CHECKING:
@@ -194,8 +194,9 @@ class Annotate:
             )
         if hidden := [a["video_id"] for a in report["annotations"] if hides_scene(a)]:
             print(printable(f"{listing(hidden)}: {HIDDEN}"), file=sys.stderr)
-        print(f"{summary(report)}; see {self.out / 'index.html'}", file=sys.stderr)
-        print(self.out)
+        page = self.out / "index.html"
+        print(printable(f"{summary(report)}; see {page}"), file=sys.stderr)
+        print_line(self.out)
         return ExitCode.PARTIAL if empty or counts["failed"] else ExitCode.DONE
 
     def _config(self) -> AnnotateConfig:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from egosim_jax.runtime.command import HelpGroups
+from egosim_jax.runtime.terminal import print_line
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -181,5 +182,5 @@ class Options:
             path = out / pages.PAGE
             pages.write_page(evaluation, methods, path, title=title, clips=self.page_clips)
         evaluation.print()
-        print(out / (pages.PAGE if paged else "report.json"))
+        print_line(out / (pages.PAGE if paged else "report.json"))
         return evaluation

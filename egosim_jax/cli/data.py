@@ -17,7 +17,7 @@ from egosim_jax.cli.triplets import Align, Mix, Static, ToDwm
 from egosim_jax.data.clip_files import ClipFiles, Prompts
 from egosim_jax.runtime.command import ExitCode, Writes, group
 from egosim_jax.runtime.progress import track
-from egosim_jax.runtime.terminal import make_console, printable
+from egosim_jax.runtime.terminal import make_console, print_line, printable
 from egosim_jax.types import WAN_GRID, InputError, VideoGrid, VideoSpec, check_counts
 
 
@@ -108,7 +108,7 @@ class Pack:
             # at once: if all are skipped, `pack` raises
             print(printable(f"skipped: {problem}"), file=sys.stderr)
             skipped += 1
-        print(self.out)
+        print_line(self.out)
         return ExitCode.PARTIAL if skipped else ExitCode.DONE
 
     def _spec(self, fps: int | None, first: ClipFiles) -> VideoSpec | None:
@@ -196,7 +196,7 @@ class Encode:
             )
         for number in skipped:
             print(printable(f"skipped: {source.name(number)}"), file=sys.stderr)
-        print(self.out)
+        print_line(self.out)
         return ExitCode.PARTIAL if skipped else ExitCode.DONE
 
 
@@ -271,7 +271,7 @@ class Make:
         progress = make_shards(config, out=self.out, workers=self.workers, grid=_grid(self.config))
         for _ in track(progress, "making", total=self.scenes):
             pass
-        print(self.out)
+        print_line(self.out)
         return ExitCode.DONE
 
 
@@ -336,7 +336,7 @@ class Look:
             moments=self.moments,
         )
         draw_sheet(clips, self.out, moments=range(self.moments), width=self.width)
-        print(self.out)
+        print_line(self.out)
         return ExitCode.DONE
 
 

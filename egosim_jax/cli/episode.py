@@ -12,7 +12,7 @@ import tyro
 
 from egosim_jax.rendering import RendererName
 from egosim_jax.runtime.command import ExitCode, Writes, group
-from egosim_jax.runtime.terminal import counted
+from egosim_jax.runtime.terminal import counted, print_line
 from egosim_jax.types import InputError, check_counts, check_seed, object_name
 
 if TYPE_CHECKING:
@@ -284,7 +284,7 @@ class CheckEpisode:
         episode = Episode.load(self.path)
         if self.config is not None:
             check_fits(episode, configs.get(self.config).video, self.config)
-        print(f"{self.path}: {summary(episode)}")
+        print_line(f"{self.path}: {summary(episode)}")
         if not (episode.state.object_ids > 0).any():
             print(printable(f"warning: {self.path}: {NO_OBJECTS}"), file=sys.stderr)
         return ExitCode.DONE
@@ -326,7 +326,7 @@ class ShowEpisode:
             sheet.append(SheetClip(title, list(videos.values())))
         out = self.out or Path(f"{self.path.stem}.png")
         draw_sheet(sheet, out, moments=sheet_moments(episode.shape[0]))
-        print(out)
+        print_line(out)
         return ExitCode.DONE
 
     def _objects(self, episode: episodes.Episode) -> SheetClip:
@@ -366,11 +366,11 @@ def _save(episode: episodes.Episode, out: Path, *, describe: bool = False) -> in
     """
     _keep_others(episode, out)
     episode.save(out)
-    print(f"{out}: {summary(episode)}")
+    print_line(f"{out}: {summary(episode)}")
     if describe:
         from egosim_jax.cli.objects import describe_objects
 
-        print(describe_objects(episode.state))
+        print_line(describe_objects(episode.state))
     return ExitCode.DONE
 
 

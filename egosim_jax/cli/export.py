@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import tyro
 
 from egosim_jax.runtime.command import ExitCode
-from egosim_jax.runtime.terminal import printable
+from egosim_jax.runtime.terminal import print_line, printable
 from egosim_jax.types import InputError
 
 
@@ -58,5 +58,5 @@ class Export:
         else:
             for session in sessions:
                 dataset_export.to_rerun(session, self.out / f"{session.id}.rrd")
-        print(self.out)
+        print_line(self.out)
         return ExitCode.PARTIAL if damaged else ExitCode.DONE

@@ -20,7 +20,7 @@ from egosim_jax.data.readers.record3d import Record3D
 from egosim_jax.data.readers.taste_rob import TasteRob
 from egosim_jax.runtime.command import ExitCode, group
 from egosim_jax.runtime.progress import track
-from egosim_jax.runtime.terminal import printable
+from egosim_jax.runtime.terminal import print_line, printable
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,13 +45,13 @@ class Output:
         for outcome in track(outcomes, "importing", total=total):
             done, resumed = done + (outcome.problem is None), resumed + outcome.resumed
             if outcome.note is not None:
-                print(f"{outcome.recording_id}: {outcome.note}", file=sys.stderr)
+                print(printable(f"{outcome.recording_id}: {outcome.note}"), file=sys.stderr)
             if outcome.problem is not None:
                 problem = f"skipped: {outcome.recording_id}: {outcome.problem}"
                 print(printable(problem), file=sys.stderr)
         earlier = f", {resumed} of them earlier" if resumed else ""
         print(f"{done} of {total} recordings imported{earlier}", file=sys.stderr)
-        print(self.out)
+        print_line(self.out)
         return ExitCode.DONE if done == total else ExitCode.PARTIAL
 
 

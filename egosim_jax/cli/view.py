@@ -17,7 +17,7 @@ from egosim_jax.io.journal import NAME as JOURNAL
 from egosim_jax.rendering.portrait import write_portrait
 from egosim_jax.rendering.rerun_log import RECORDING
 from egosim_jax.runtime.command import ExitCode, Writes
-from egosim_jax.runtime.terminal import printable
+from egosim_jax.runtime.terminal import print_line
 from egosim_jax.state.planes import vertical
 from egosim_jax.types import InputError
 
@@ -56,7 +56,7 @@ class View:
             return _open(recording, self.host)
         if (self.path / "report.json").exists() and (page := self.path / PAGE).exists():
             self._refuse_out(f"{page} exists")  # of an evaluation or of annotated clips
-            print(page)
+            print_line(page)
             return ExitCode.DONE
         if (self.path / JOURNAL).exists():
             first = self.path / "state_0.ply"
@@ -83,8 +83,8 @@ class View:
         low, high = state.points_m.min(axis=0), state.points_m.max(axis=0)
         size = " x ".join(f"{length:.2f}" for length in high - low)
         objects = ", ".join(state.names.values()) or "no named objects"
-        print(printable(f"{len(state.points_m)} points, {size} m, {objects}"))
-        print(out)
+        print_line(f"{len(state.points_m)} points, {size} m, {objects}")
+        print_line(out)
         return ExitCode.DONE
 
     def _refuse_out(self, why: str) -> None:

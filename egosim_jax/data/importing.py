@@ -19,6 +19,7 @@ from egosim_jax.data.recorded_files import DESCRIPTION
 from egosim_jax.data.recording import ARRAYS, Recording
 from egosim_jax.io.atomic import atomic_folder, check_replaceable, lock_folder
 from egosim_jax.io.bounded import only_inside, open_regular
+from egosim_jax.runtime.terminal import check_utf8
 from egosim_jax.types import InputError, check_counts
 
 FIXED = {"camera": "fixed"}
@@ -79,7 +80,8 @@ def _import(
 
 def _import_one(dataset: str, entry: Entry, folder: Path) -> Outcome:
     """Read and write a recording, unless an earlier import wrote it."""
-    made_of = {"dataset": dataset, "source": str(entry.source.resolve()), **entry.options}
+    check_utf8(source := entry.source.resolve())
+    made_of = {"dataset": dataset, "source": str(source), **entry.options}
     if (folder / DESCRIPTION).exists():
         try:
             written = Recording.load(folder).provenance

@@ -41,7 +41,7 @@ def pair_rows(
     text = f"{quote_path(video)} has {frames} frames and {rows} {what}"
     if fewer < 1:
         raise InputError(f"{text}: at least one frame must have its own. Get both files again.")
-    if more > max(fewer + 1, fewer * MAX_RATE_RATIO):
+    if not alike(fewer, more):
         rate = float(info.fps) * rows / frames
         raise InputError(
             f"{text}, as at {rate:.4g} frames per second instead of {float(info.fps):.4g}: frame "
@@ -52,6 +52,12 @@ def pair_rows(
     if frames != rows:
         logger.warning("%s: the first %d of both are used", text, fewer)
     return np.arange(fewer)
+
+
+def alike(rows: int, frames: int) -> bool:
+    """Return True for lengths that differ by at most one frame or 1 %: of one rate."""
+    fewer, more = sorted((rows, frames))
+    return more <= max(fewer + 1, fewer * MAX_RATE_RATIO)
 
 
 def by_frame(

@@ -18,7 +18,7 @@ from egosim_jax.evaluation.metrics.report import (
     summarize,
 )
 from egosim_jax.evaluation.scoring import OWN, Protocol, Row, Scoring, row_of
-from egosim_jax.runtime.terminal import counted
+from egosim_jax.runtime.terminal import counted, print_line
 
 KNOWN = {
     "depth_err": Column("Depth ERR of the paper", "{:.3f}", "lower"),
@@ -241,7 +241,7 @@ class Evaluation:
             columns = {k: (self.columns[k].heading, self.columns[k].form) for k in shown[0]}
             print_table("clip", rows, columns, title=f"{self.titles[method]}: decay by clip")
         for line in self.notes():
-            print(line)
+            print_line(line)
 
     def notes(self) -> list[str]:
         """Return protocol, definitions and sources as lines of text."""

@@ -29,7 +29,7 @@ from egosim_jax.io.bounded import listing
 from egosim_jax.io.digest import fingerprint, sha256
 from egosim_jax.io.video import VideoInfo, probe_video
 from egosim_jax.runtime.progress import track
-from egosim_jax.runtime.terminal import counted
+from egosim_jax.runtime.terminal import counted, printable
 from egosim_jax.types import InputError
 
 MAX_RATE_ERROR = 0.01
@@ -138,7 +138,7 @@ class Scoring:
             except InputError as error:
                 self.skipped.append(f"{window.output_id}: {error}")
         for line in self.skipped:
-            print(f"skipped: {line}", file=sys.stderr)
+            print(printable(f"skipped: {line}"), file=sys.stderr)
         if not rows:
             shown = ", ".join(str(folder.path) for folder in self.folders)
             raise InputError(f"No clip in {shown} could be compared. (--generated)")

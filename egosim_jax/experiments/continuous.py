@@ -12,6 +12,7 @@ from egosim_jax.experiments.report import Scores, cached, plot, show_by_clip, wr
 from egosim_jax.generation.generator import Generator
 from egosim_jax.perception import registry
 from egosim_jax.runtime.progress import track
+from egosim_jax.runtime.terminal import print_line
 from egosim_jax.simulation.rollout import Rollout
 from egosim_jax.simulation.simulator import Simulator
 from egosim_jax.state.new_objects import without_ids
@@ -55,7 +56,7 @@ def run(settings: Continuous) -> None:
         title = f"{method}: difference from no update, with its 95 % interval"
         show_by_clip(title, rows, MEASURES)
     draw_curves(tables, settings.out / "curves.png")
-    print(settings.out / "curves.png")
+    print_line(settings.out / "curves.png")
 
 
 def folder_name(method: str) -> str:

@@ -45,6 +45,7 @@ from egosim_jax.robots.conversion import convert, triplets_of
 from egosim_jax.robots.models import RobotModel, load_model
 from egosim_jax.robots.sources import of_episode
 from egosim_jax.runtime.progress import track
+from egosim_jax.runtime.terminal import print_line
 from egosim_jax.train.encode import encode_shards
 from egosim_jax.train.tasks.denoising import Denoising
 from egosim_jax.types import InputError, Kind
@@ -125,7 +126,7 @@ def run(settings: Embodiment) -> None:
     sheet, curves = out / "contact_sheet.png", out / "curves.png"
     draw_scenes(sheet, scenes, {name: videos[name] for name in trained})
     _draw_curves(losses, curves)
-    print(f"{sheet}\n{curves}")
+    print_line(f"{sheet}\n{curves}")
 
 
 class _Experiment:

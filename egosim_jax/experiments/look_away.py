@@ -25,6 +25,7 @@ from egosim_jax.generation.generator import Generator
 from egosim_jax.geometry import invert, transform
 from egosim_jax.perception import registry
 from egosim_jax.runtime.progress import track
+from egosim_jax.runtime.terminal import print_line
 from egosim_jax.simulation.rollout import Rollout, load_clip
 from egosim_jax.simulation.simulator import Simulator
 from egosim_jax.state.fuse import fuse
@@ -249,4 +250,4 @@ def _draw(out: Path, seeds: list[int], spec: VideoSpec) -> None:
             shown.append(SheetClip(title, list(videos.values())))
     moments = [0, spec.frames // 4, spec.frames // 2, 3 * spec.frames // 4, spec.frames - 1]
     draw_sheet(shown, out / "contact_sheet.png", moments=moments)
-    print(out / "contact_sheet.png")
+    print_line(out / "contact_sheet.png")

@@ -23,6 +23,7 @@ from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.perception import Perception, registry
 from egosim_jax.runtime.progress import track
+from egosim_jax.runtime.terminal import print_line
 from egosim_jax.state.fuse import fuse
 from egosim_jax.types import Action, Cameras, Clip, Triplet
 from egosim_jax.worlds.tabletop import Scene, Script, World
@@ -255,4 +256,5 @@ def _draw(out: Path, tasks: Sequence[Task], generator: Generator) -> None:
     last = generator.config.video.frames - 1
     moments = [round(share * last) for share in (0, 0.25, 0.5, 0.75, 1)]
     draw_sheet(clips, out / "contact_sheet.png", moments=moments)
-    print(out / "ranking.png", out / "contact_sheet.png", sep="\n")
+    print_line(out / "ranking.png")
+    print_line(out / "contact_sheet.png")

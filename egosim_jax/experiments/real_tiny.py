@@ -24,6 +24,7 @@ from egosim_jax.experiments.config import Debug, RealTiny
 from egosim_jax.generation.batch import BatchJob
 from egosim_jax.io.run import write_json, write_text
 from egosim_jax.io.video import read_video
+from egosim_jax.runtime.terminal import print_line
 from egosim_jax.train.from_scratch import SYNTHETIC_CLIPS
 from egosim_jax.train.recipes import DEBUG, REAL_TINY
 
@@ -66,7 +67,7 @@ def compare(
         )
         job.open()
         job.generate(windows_of(clips, starts))
-        print(name)
+        print_line(name)
         evaluation = evaluate(folder, clips)
         evaluation.print()
         return evaluation.report
@@ -84,7 +85,7 @@ def compare(
     write_json(out / "report.json", reports)
     sheet = out / "contact_sheet.png"
     draw_sheet(list(_sheet_clips(out / "generated")), sheet, moments=SHEET_FRAMES)
-    print(sheet)
+    print_line(sheet)
 
 
 def _swap(metadata: Path, path: Path) -> Path:

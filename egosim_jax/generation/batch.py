@@ -44,7 +44,7 @@ from egosim_jax.io.weights import hashes
 from egosim_jax.io.writing import write_video
 from egosim_jax.rendering.mesh import hand_mask
 from egosim_jax.runtime.phases import phase
-from egosim_jax.runtime.terminal import printable
+from egosim_jax.runtime.terminal import print_line, printable
 from egosim_jax.sharding import check_batch, make_mesh, parts
 from egosim_jax.types import Clip, InputError, MeshConfig, Triplet
 
@@ -174,7 +174,7 @@ class BatchJob:
             self._draw(windows)
         outcome = Outcome(len(skipped), len(valid) - len(failed), len(rejected), len(failed))
         bad = outcome.rejected + outcome.failed
-        print(f"{outcome.done} done, {bad} failed: {self.out}", file=sys.stderr)
+        print(printable(f"{outcome.done} done, {bad} failed: {self.out}"), file=sys.stderr)
         return outcome
 
     def _place(self) -> tuple[Mesh, int]:
@@ -353,7 +353,7 @@ class BatchJob:
             self._write(window, triplet, clip, reconstruction)
             self._report(window, status="done", seed=seed, seconds=round(seconds, 3),
                          conditions_sha256=digest)  # fmt: skip
-            print(self._video(window))
+            print_line(self._video(window))
         return []
 
     def _clips(
@@ -409,7 +409,7 @@ class BatchJob:
             moments = np.linspace(0, last, SHEET_COLUMNS).round().astype(int)
             sheet = self.out / "contact_sheet.png"
             draw_sheet(clips, sheet, moments=moments.tolist(), width=SHEET_WIDTH)
-            print(sheet)
+            print_line(sheet)
 
     def _sheet_clips(self, windows: Sequence[Window]) -> Iterator[SheetClip]:
         for window in windows:

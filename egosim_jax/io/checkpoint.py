@@ -26,6 +26,7 @@ from egosim_jax.io.atomic import TEMPORARY
 from egosim_jax.io.bounded import listing, quote_text, read_json
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.run import write_json
+from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import InputError
 
 STATE, DATA = "state", "data"
@@ -154,7 +155,7 @@ class Checkpoints:
                     f"{message} Restore the files, or use the checkpoint before it. "
                     "(--training.fallback)"
                 )
-            print(message, file=sys.stderr)
+            print(printable(message), file=sys.stderr)
             self._set_aside(step)
         raise InputError(f"There is no valid checkpoint in {self.folder}.")
 

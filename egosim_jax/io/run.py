@@ -18,6 +18,7 @@ import numpy as np
 from egosim_jax.io.atomic import atomic_write, hold_folder
 from egosim_jax.io.bounded import MAX_QUOTED, quote, quote_text, read_json
 from egosim_jax.io.differences import describe
+from egosim_jax.runtime.terminal import check_utf8
 from egosim_jax.types import InputError
 
 CONFIG, ENVIRONMENT = "config.json", "environment.json"
@@ -40,7 +41,10 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Return the JSON form of a value; dataclasses get their class name as `type`."""
+    """Return the JSON form of a value; dataclasses get their class name as `type`.
+
+    Raises `InputError` for the name of a file that is not UTF-8: it could not be read again.
+    """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return {"type": type(value).__name__, **fields}
@@ -50,8 +54,9 @@ def plain(value: Any) -> Any:
         return [plain(item) for item in value]
     if isinstance(value, Fraction):
         return float(value)
-    if value is None or isinstance(value, (bool, int, float, str)):
+    if value is None or isinstance(value, (bool, int, float)):
         return value
+    check_utf8(value)
     return str(value)
 
 

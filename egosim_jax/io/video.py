@@ -47,8 +47,11 @@ from egosim_jax.types import InputError
 
 logger = logging.getLogger(__name__)
 
-VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".ts", ".mts")
-"""Suffixes of the files that are taken for videos."""
+VIDEO_SUFFIXES = (
+    ".mp4", ".m4v", ".mov", ".qt", ".3gp", ".mkv", ".webm", ".avi", ".ts", ".mts", ".m2ts",
+    ".mpg", ".mpeg", ".wmv", ".flv", ".ogv",
+)  # fmt: skip
+"""Suffixes of the files that are taken for videos; files of the last line are refused by name."""
 MAX_KEPT = 3 * 2**28
 """Maximum size of the frames that one call returns, in bytes."""
 Each = Callable[[np.ndarray], np.ndarray]

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import errno
+import io
 import logging
 import os
 import re
 import select
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import MISSING, fields, is_dataclass, make_dataclass, replace
 from enum import IntEnum
@@ -29,9 +29,10 @@ from typing import (
 )
 
 from egosim_jax.runtime import interrupts, preemption
+from egosim_jax.runtime.failures import system_failure, undecoded_text
 from egosim_jax.runtime.options import meant, show_options
 from egosim_jax.runtime.phases import show_phases
-from egosim_jax.runtime.terminal import printable
+from egosim_jax.runtime.terminal import check_utf8, printable
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -136,6 +137,7 @@ def main(
         about = f"{description} --version prints the version."
         command = parse(commands, given, program=program, about=about, others=others)
         _refuse_empty(command)
+        _refuse_undecoded_places(command)
         _refuse_file(command)
         with context(), show_phases(), show_options(command):
             code = command.run()
@@ -149,13 +151,21 @@ def main(
 def _refuse_undecoded(given: Sequence[str]) -> None:
     """Raise `InputError` for an argument that is not text: no report could name such a path."""
     for argument in given:
-        try:
-            argument.encode()
-        except UnicodeEncodeError as error:
-            raise InputError(
-                f"{printable(argument)} is not valid UTF-8: the files that commands write could "
-                "not name it. Rename it, for instance by `convmv -f latin1 -t utf8 --notest PATH`."
-            ) from error
+        check_utf8(argument)
+
+
+def _refuse_undecoded_places(command: Any) -> None:
+    """Raise `InputError` for a path that leads to a name that is not UTF-8.
+
+    So do relative paths in such a folder, and links.
+    """
+    for field in fields(command):
+        value = getattr(command, field.name)
+        if is_dataclass(value):
+            _refuse_undecoded_places(value)
+        for path in value if isinstance(value, tuple) else (value,):
+            if isinstance(path, Path):
+                check_utf8(os.path.realpath(path))
 
 
 def _refuse_empty(command: Any) -> None:
@@ -313,6 +323,7 @@ def _rules(args: Sequence[str]) -> ConstructorRegistry:
 def run_with_exit_codes(run: Callable[[], int]) -> int:
     """Run a command, printing exceptions as messages and returning their exit codes."""
     interrupts.begin()
+    _escape_output()
     try:
         return run()
     except InputError as error:
@@ -325,6 +336,9 @@ def run_with_exit_codes(run: Callable[[], int]) -> int:
         interrupts.print_interrupted()
         return ExitCode.INTERRUPTED
     except Exception as error:
+        if undecoded := undecoded_text(error):
+            print(f"error: {printable(undecoded)}", file=sys.stderr)
+            return ExitCode.USAGE
         if isinstance(error, BrokenPipeError) and _reader_ended():
             return ExitCode.FAILED
         if (reason := system_failure(error)) is not None:
@@ -334,6 +348,12 @@ def run_with_exit_codes(run: Callable[[], int]) -> int:
         return ExitCode.FAILED
     finally:
         _reader_ended()  # also after --help, which exits
+
+
+def _escape_output() -> None:
+    """Write what the encoding of stdout lacks as escapes, as Python does on stderr."""
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def _reader_ended() -> bool:
@@ -352,54 +372,3 @@ def _reader_ended() -> bool:
         return False
     os.dup2(os.open(os.devnull, os.O_WRONLY), number)
     return True
-
-
-def system_error(error: BaseException) -> tuple[int, str] | None:
-    """Return the code of a system error (disk, permissions) or of its cause, and where it was.
-
-    C++ libraries raise other errors, which have the system's reason in their text.
-    """
-    for seen in _causes(error):
-        text = str(seen).replace("\n", " ")
-        for code in REFUSALS:
-            reason = os.strerror(code)
-            if (isinstance(seen, OSError) and seen.errno == code) or reason in text:
-                name = getattr(seen, "filename", None)
-                return code, f"{name}: {reason}" if name else text[:300]
-    return None
-
-
-def system_failure(error: BaseException) -> str | None:
-    """Return a one-line message for a system error or for too little memory, or None."""
-    if any(isinstance(seen, MemoryError) for seen in _causes(error)):
-        return "not enough memory. Use smaller batches or a machine with more memory."
-    failure = system_error(error)
-    return None if failure is None else f"{failure[1]}. {REFUSALS[failure[0]]}"
-
-
-def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    while error is not None:
-        yield error
-        error = error.__cause__ or error.__context__
-
-
-_WRITABLE = "Choose a folder that can be written to. (--out)"
-_RUN_AGAIN = "Free space and run the same command again; complete files are kept."
-REFUSALS = {
-    errno.ENOSPC: _RUN_AGAIN,
-    errno.EDQUOT: _RUN_AGAIN,
-    errno.EFBIG: _RUN_AGAIN,
-    errno.EROFS: _WRITABLE,
-    errno.EACCES: _WRITABLE,
-    errno.EPERM: _WRITABLE,
-    errno.ENOTDIR: "A file exists where a folder is needed: choose another path.",
-    errno.EISDIR: "A folder exists where a file is needed: choose another path.",
-    errno.EEXIST: "The path exists already: choose another path.",
-    errno.ENAMETOOLONG: "Choose a shorter path.",
-    errno.ELOOP: "Links are not followed here: give the real path.",
-    errno.ENOENT: "Check the path.",
-    errno.EMFILE: "Raise the limit on open files (ulimit -n).",
-    errno.EBUSY: "A mount point cannot be replaced: choose a folder inside it.",
-    errno.EIO: "Check the disk.",
-}
-"""System errors that a user can fix, and the fix."""

@@ -1,7 +1,7 @@
 """Commands that are killed at random times and run again, until what they write is complete.
 
 The files are then compared, byte for byte, with the files of a run without a kill. Only times and
-process numbers are skipped: `IGNORED` and `TIMED`.
+process numbers are skipped: `IGNORED`, `TIMED` and the seconds in JSON.
 """
 
 from __future__ import annotations
@@ -15,11 +15,14 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from tests.flags import QUICK
+
+ROOT = Path(__file__).parents[2]
 
 IGNORED = {
     ".lock": "the PID of the process that wrote last",
@@ -30,7 +33,16 @@ IGNORED = {
     "the log and the weights, is compared",
 }
 """Files, and folders with all that is in them, that two runs without a kill do not share."""
-TIMED = ("step_time_s", "chain", "data_wait_frac", "tflops", "mfu", "peak_mem_gb", "eta_min")
+TIMED = (
+    "seconds",
+    "step_time_s",
+    "chain",
+    "data_wait_frac",
+    "tflops",
+    "mfu",
+    "peak_mem_gb",
+    "eta_min",
+)
 """Fields of a log's lines that depend on the clock, or are a hash over such fields."""
 MODEL = "--config debug --weights ../weights"
 OF_A_CLIP = "--frames 9 --height 64 --width 96 --fps 16 --workers 1"
@@ -46,6 +58,8 @@ COMMANDS = {
     "train": f"egosim_jax.train egosim_14b_fewshot {MODEL} --latents ../latents --training.steps 8 "
     "--training.batch-size 2 --training.log-every 1 --training.save-every 2",
     "convert": "egosim_jax.convert weights ../torch --config debug",
+    "annotate": "tests.crash.commands data annotate ../videos --renderer numpy",
+    "robot": "tests.crash.commands robot render ../episode --robot toy",
 }
 """Each without its `--out out`; run in a folder next to the folders of `INPUTS`."""
 WEIGHTS = "from egosim_jax import configs, testing; from pathlib import Path; "
@@ -65,6 +79,8 @@ INPUTS = {
     "clips": f"-m egosim_jax.cli generate {MODEL[:-10]}weights --limit 2 --out clips".split(),
     "frames": f"-m {MAKE} --out frames".split(),
     "latents": f"-m {ENCODE} --out latents".replace("../", "").split(),
+    "videos": ["-m", "tests.crash.commands", "--make", "videos"],
+    "episode": ["-m", "tests.crash.commands", "--make", "episode"],
 }
 """Commands that make the inputs of the others, in their order."""
 
@@ -85,11 +101,14 @@ class Tally:
         return f"{self.name}: {counts} in {self.trials} trials of {self.seconds:.1f} s"
 
 
-def prepare(folder: Path) -> None:
-    """Make in `folder` what the commands are given."""
+def prepare(folder: Path, commands: Iterable[str]) -> None:
+    """Make in `folder` what some commands are given, and what that is made of."""
     folder.mkdir(parents=True, exist_ok=True)
+    words = {word.removeprefix("../") for command in commands for word in command.split()}
+    for name in reversed(INPUTS):
+        words |= {*INPUTS[name]} if name in words else set()
     for name, arguments in INPUTS.items():
-        if not (folder / name).exists():
+        if name in words and not (folder / name).exists():
             _python(arguments, folder)
 
 
@@ -121,7 +140,8 @@ def kill_often(name: str, folder: Path, *, kills: int, seed: int) -> Tally:
 def main(names: Sequence[str], folder: Path, *, kills: int, seed: int) -> int:
     """Kill each of the commands; the exit code."""
     os.environ |= {"XLA_FLAGS": QUICK, "XDG_CACHE_HOME": str(folder.absolute() / "cache")}
-    prepare(folder)
+    os.environ["PYTHONPATH"] = str(ROOT)
+    prepare(folder, [COMMANDS[name] for name in names])
     tallies = []
     for name in names:
         each = -(-kills // len(names))
@@ -144,6 +164,8 @@ def artifacts(folder: Path) -> dict[str, str]:
 def _content(path: Path) -> bytes:
     if path.is_dir():
         return b"a folder"
+    if path.suffix == ".json":
+        return json.dumps(_without_times(json.loads(path.read_text("utf-8")))).encode()
     if path.suffix != ".jsonl":
         return path.read_bytes()
     lines = [json.loads(line) for line in path.read_text("utf-8").splitlines()]
@@ -151,6 +173,13 @@ def _content(path: Path) -> bytes:
         lines = sorted({line["video_id"]: line for line in lines}.items())
         lines = [line for _, line in lines]
     return repr([{k: v for k, v in line.items() if k not in TIMED} for line in lines]).encode()
+
+
+def _without_times(value: Any) -> Any:
+    """Return a JSON value without the seconds that its parts took."""
+    if isinstance(value, dict):
+        return {name: _without_times(v) for name, v in value.items() if name != "seconds"}
+    return [_without_times(item) for item in value] if isinstance(value, list) else value
 
 
 def differences(wanted: dict[str, str], have: dict[str, str]) -> list[str]:

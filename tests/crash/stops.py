@@ -178,7 +178,7 @@ def _stopped_after(chance: random.Random, run: Training, tally: Tally) -> bool:
 def main(names: Sequence[str], folder: Path, *, stops: int, seed: int) -> int:
     """Stop each of the trainings, on one and on two processes; the exit code."""
     os.environ |= {"XLA_FLAGS": QUICK, "XDG_CACHE_HOME": str(folder.absolute() / "cache")}
-    prepare(folder)
+    prepare(folder, [START])
     if not (folder / "start" / "weights").exists():
         command = [sys.executable, "-m", "egosim_jax.train", *START.replace("../", "").split()]
         subprocess.run(command, cwd=folder, check=True)

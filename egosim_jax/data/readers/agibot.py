@@ -14,7 +14,8 @@ is the robot's base.
 
 Two readings of the extrinsics are in use: camera to base, and base to camera. Both project the
 points between the fingers. The reading that puts more points into the image is taken and recorded.
-If both readings are equal, the recording is refused unless the user decides.
+If both readings are equal, the recording is refused unless the user decides. Without intrinsics,
+extrinsics or openings, this part stays unknown, and what depends on it: grippers need poses.
 
 A gripper has three joints: the flange, and the tips of thumb and index finger. The tips are
 `TOOL_M` along the flange's z axis, and half of the opening to either side along its y axis. The
@@ -144,20 +145,26 @@ class AgiBot:
         lens = _read_lens(files.camera / "head_intrinsic_params.json", info)
         matrices = _read_extrinsics(files.camera / "head_extrinsic_params_aligned.json")
         joints, tools, notes = _read_grippers(files.states, self.opening)
-        tables = sorted([(len(matrices), "camera poses"), (len(joints), "states")])
-        rows, _ = (pair_rows(files.video, info, count, what=what) for count, what in tables)
+        tables = [(len(joints), "states")]
+        tables += [] if matrices is None else [(len(matrices), "camera poses")]
+        rows, *_ = (pair_rows(files.video, info, n, what=what) for n, what in sorted(tables))
         span = _span(part, rows, files.video)
         rows = rows[span]
-        joints, matrices = joints[rows], matrices[rows]
-        poses, decision = self._decide(matrices, tools[rows], lens)
-        remap = None if lens.is_pinhole() else Remap.of(lens)
-        cameras = Cameras(
+        poses, decision = self._decide(
+            None if matrices is None else matrices[rows], tools[rows], lens
+        )
+        if "unknown" in decision["extrinsics"]:
+            where = quote_path(files.camera)
+            logger.warning("%s: poses and grippers are %s", where, decision["extrinsics"])
+        remap = None if lens is None or lens.is_pinhole() else Remap.of(lens)
+        intrinsics = None if lens is None else (remap or lens).intrinsics_px
+        cameras = None if poses is None or intrinsics is None else Cameras(
             world_from_camera=poses,
-            intrinsics_px=lens.intrinsics_px if remap is None else remap.intrinsics_px,
+            intrinsics_px=intrinsics,
             height=info.height,
             width=info.width,
-        )
-        joints, counts = clean_joints(joints, cameras)
+        )  # fmt: skip
+        joints, counts = clean_joints(None if poses is None else joints[rows], cameras)
         video, start = files.video, span.start
         if remap is not None:
             video, start = _remap_video(files.video, span, info, remap, folder), 0
@@ -170,8 +177,8 @@ class AgiBot:
             height=info.height,
             width=info.width,
             world_from_camera=poses,
-            intrinsics_px=cameras.intrinsics_px,
-            metric=True,
+            intrinsics_px=intrinsics,
+            metric=poses is not None,
             joints_m=None if joints is None or np.isnan(joints).all() else joints,
             kind="robot",
             depth=_find_depth(files.depth, rows, files.video, info) if remap is None else None,
@@ -185,22 +192,36 @@ class AgiBot:
         )
 
     def _decide(
-        self, matrices: Float[np.ndarray, "f 4 4"], tools: Float[np.ndarray, "f 2 3"], lens: Lens
-    ) -> tuple[Float[np.ndarray, "f 4 4"], dict[str, str]]:
-        """Return camera poses in the base by the chosen reading, and the evidence for it."""
+        self,
+        matrices: Float[np.ndarray, "f 4 4"] | None,
+        tools: Float[np.ndarray, "f 2 3"],
+        lens: Lens | None,
+    ) -> tuple[Float[np.ndarray, "f 4 4"] | None, dict[str, str]]:
+        """Return camera poses in the base by the chosen reading, or None, and the evidence for it.
+
+        Without intrinsics only the user can choose.
+        """
+        if matrices is None:
+            return None, {"extrinsics": "unknown: none"}
         readings: dict[Reading, np.ndarray] = {
             "camera_to_base": matrices, "base_to_camera": invert(matrices),
         }  # fmt: skip
+        chosen = self.extrinsics
+        if lens is None:
+            if chosen is None:
+                why = "unknown: no intrinsics to decide their reading by; choose it (--extrinsics)"
+                return None, {"extrinsics": why}
+            return readings[chosen], {"extrinsics": chosen, "extrinsics_by": "user"}
         shares = {name: share_in_view(poses, tools, lens) for name, poses in readings.items()}
         best, other = sorted(readings, key=lambda name: -shares[name])
         written = ", ".join(f"{name} {share:.2f}" for name, share in shares.items())
-        chosen = self.extrinsics or best
-        if self.extrinsics is None and not shares[best] > shares[other]:
+        if chosen is None and not shares[best] > shares[other]:
             raise InputError(
                 f"The reading of the extrinsics cannot be decided: the share of gripper points in "
                 f"the image is {written}, and one must be larger. Choose one. (--extrinsics)"
             )
-        by = "user" if self.extrinsics else "projected grippers"
+        by = "projected grippers" if chosen is None else "user"
+        chosen = chosen or best
         return readings[chosen], {
             "extrinsics": chosen, "extrinsics_by": by, "grippers_in_view": written
         }  # fmt: skip
@@ -264,11 +285,15 @@ def _span(part: _Part, rows: Int[np.ndarray, " f"], video: Path) -> slice:
     return slice(start, stop)
 
 
-def _read_lens(path: Path, info: VideoInfo) -> Lens:
-    written = read_json(path)
-    values = written.get("intrinsic") if isinstance(written, dict) else None
+def _read_lens(path: Path, info: VideoInfo) -> Lens | None:
+    """Return the camera's lens, or None if the dataset does not have it."""
+    written = read_json(path) if path.exists() else {}
+    values = written.get("intrinsic", {}) if isinstance(written, dict) else None
     if not isinstance(values, dict):
         raise InputError(f"{quote_path(path)} has no intrinsic.")
+    if not values:
+        logger.warning("%s: missing or empty; intrinsics stay unknown", quote_path(path))
+        return None
     fx, fy, cx, cy = (_number(values, name, path) for name in ("fx", "fy", "ppx", "ppy"))
     names = ("k1", "k2", "p1", "p2", "k3")
     return Lens(
@@ -287,10 +312,13 @@ def _number(values: Mapping[str, Any], name: str, path: Path) -> float:
     return float(value)
 
 
-def _read_extrinsics(path: Path) -> Float[np.ndarray, "f 4 4"]:
-    written = read_json(path, limit=1 << 27)
-    if not isinstance(written, list) or not written:
+def _read_extrinsics(path: Path) -> Float[np.ndarray, "f 4 4"] | None:
+    """Return the matrices of the frames, or None if the dataset does not have them."""
+    written = read_json(path, limit=1 << 27) if path.exists() else []
+    if not isinstance(written, list):
         raise InputError(f"{quote_path(path)} is not a list of one entry per frame.")
+    if not written:
+        return None
     matrices = np.tile(np.eye(4), (len(written), 1, 1))
     for number, entry in enumerate(written):
         values: Any = entry.get("extrinsic") if isinstance(entry, dict) else None
@@ -310,10 +338,11 @@ def _read_grippers(
 ) -> tuple[Float[np.ndarray, "f 2 3 3"], Float[np.ndarray, "f 2 3"], dict[str, str]]:
     """Return joints and points between the fingers in the base, and the reading of the opening."""
     end, effector = "state/end", "effector/position"
-    shapes = {f"{end}/position": (None, 2, 3), f"{end}/orientation": (None, 2, 4),
-              f"state/{effector}": (None, None)}  # fmt: skip
-    arrays = read_hdf5(path, shapes, optional={f"action/{effector}": (None, None)}).arrays
-    positions, orientations, opening = (arrays[name] for name in shapes)
+    shapes = {f"{end}/position": (None, 2, 3), f"{end}/orientation": (None, 2, 4)}
+    openings = {f"{kind}/{effector}": (None, None) for kind in ("state", "action")}
+    arrays = read_hdf5(path, shapes, optional=openings).arrays
+    positions, orientations = (arrays[name] for name in shapes)
+    opening = arrays.get(f"state/{effector}", np.zeros((len(positions), 0)))
     if not len(positions) == len(orientations) == len(opening):
         raise InputError(
             f"{quote_path(path)} has {len(positions)} positions, {len(orientations)} orientations "
@@ -322,7 +351,8 @@ def _read_grippers(
     rotations = from_quaternions(orientations)
     tools = positions + TOOL_M * rotations[..., 2]
     if opening.shape[1] != 2:
-        return np.full((len(positions), 2, 3, 3), np.nan), tools, {"hands": "not grippers"}
+        hands = "not grippers" if opening.shape[1] else "unknown: no openings"
+        return np.full((len(positions), 2, 3, 3), np.nan), tools, {"hands": hands}
     meaning = given or _meaning(arrays.get(f"action/{effector}"), opening, path)
     if meaning.endswith("share"):
         opening = MAX_OPENING_MM * opening

@@ -5,7 +5,8 @@
         extrinsics_000000.npy `4 4`, world to camera, OpenCV axes; intrinsics_000000.npy `3 3`;
         depth_000000.npy `h w` of the first frame
 
-Every frame needs a pose, and smoothed poses are preferred. Pixel centers are at integers, because
+Smoothed poses are preferred. Of a clip without any, video and caption are kept, and with some, the
+frames before the first one without a pose. Pixel centers are at integers, because
 the release back-projects points from integers. It runs DA3NESTED-GIANT-LARGE-1.1, which estimates
 meters, so `metric` is True, up to its error; the files do not name their network. Hands come from
 HaMeR's results in _proc/mano_full (`hamer`), if they exist. Followed: jinkun-hao/EgoSim of 2026,
@@ -33,7 +34,7 @@ from egosim_jax.data.recorded_files import DepthFiles
 from egosim_jax.data.recording import Recording
 from egosim_jax.geometry import invert
 from egosim_jax.io.bounded import quote_path, read_bytes
-from egosim_jax.io.video import probe_video
+from egosim_jax.io.video import VideoInfo, probe_video
 from egosim_jax.types import Cameras, InputError
 
 logger = logging.getLogger(__name__)
@@ -76,6 +77,9 @@ def _read(clip: Path, folder: Path) -> Recording:
     info = probe_video(video)
     info.check_square(quote_path(video))
     poses_folder = _find_poses(clip / "_proc")
+    if poses_folder is None:
+        logger.warning("%s: cameras and hands stay unknown: no extrinsics_*.npy", quote_path(clip))
+        return _of_video(clip, video, info)
     paths, found = _numbered(poses_folder)
     rows = pair_rows(video, info, found, what="extrinsics")
     rows = rows[rows < len(paths)]
@@ -95,11 +99,28 @@ def _read(clip: Path, folder: Path) -> Recording:
         seen = Cameras(world_from_camera=poses, intrinsics_px=intrinsics, height=info.height,
                        width=info.width)  # fmt: skip
         paired = replace(seen, world_from_camera=poses[rows])
-        limit = max(len(paths), len(info.timeline.listed_s))
-        joints, odd = clean_joints(read_hamer(hands[0], seen, limit)[rows], paired)
+        joints, odd = clean_joints(read_hamer(hands[0], seen, info)[rows], paired)
         counts |= odd
     depth = poses_folder / "depth_000000.npy"
     files = (depth if depth.exists() else None, *[None] * (len(rows) - 1))
+    return replace(
+        _of_video(clip, video, info),
+        frames=len(rows),
+        world_from_camera=poses[rows],
+        intrinsics_px=intrinsics,
+        metric=True,
+        joints_m=joints,
+        depth=DepthFiles(paths=files, unit_m=1.0) if files[0] else None,
+        provenance={
+            "poses": str(poses_folder.relative_to(clip)),
+            "scale": "estimated by Depth Anything 3",
+            **counts,
+        },
+    )
+
+
+def _of_video(clip: Path, video: Path, info: VideoInfo) -> Recording:
+    """Return the recording of a clip with its caption, without cameras."""
     caption = clip / "caption.txt"
     text = ""
     if caption.exists():
@@ -107,21 +128,12 @@ def _read(clip: Path, folder: Path) -> Recording:
     return Recording(
         recording_id=make_id([clip.resolve().name]),
         video=video,
-        frames=len(rows),
+        frames=info.frames,
         fps=info.fps,
         height=info.height,
         width=info.width,
-        world_from_camera=poses[rows],
-        intrinsics_px=intrinsics,
-        metric=True,
-        joints_m=joints,
-        depth=DepthFiles(paths=files, unit_m=1.0) if files[0] else None,
         caption=text or None,
-        provenance={
-            "poses": str(poses_folder.relative_to(clip)),
-            "scale": "estimated by Depth Anything 3",
-            **counts,
-        },
+        provenance={"poses": "unknown: none"},
     )
 
 
@@ -142,9 +154,8 @@ def _numbered(folder: Path) -> tuple[list[Path], int]:
     return [files[number] for number in range(first)], len(files)
 
 
-def _find_poses(folder: Path) -> Path:
-    """Return the folder of extrinsics; smoothed ones are preferred."""
+def _find_poses(folder: Path) -> Path | None:
+    """Return the folder of extrinsics, or None; smoothed ones are preferred."""
     found = sorted({path.parent for path in folder.rglob("extrinsics_*.npy")})
-    if not found:
-        raise InputError(f"{quote_path(folder)} has no extrinsics_*.npy at any depth.")
-    return max(found, key=lambda path: "smoothed" in str(path.relative_to(folder)))
+    smoothed = [path for path in found if "smoothed" in str(path.relative_to(folder))]
+    return next(iter((*smoothed, *found)), None)

@@ -139,17 +139,19 @@ def _read_cameras(
     folder: Path, video: Path, info: VideoInfo, start: int, frames: int
 ) -> tuple[np.ndarray | None, np.ndarray | None, dict[str, str]]:
     """Return the poses of the first frames and the intrinsics, None if unknown, and notes."""
-    path = next((folder / name for name in POSES if (folder / name).exists()), None)
-    if path is None:
-        raise InputError(f"{quote_path(folder)} has none of {', '.join(POSES)}.")
-    matrices = read_matrices(path, (None, 4, 4))
-    rows, other = np.arange(min(frames, len(matrices))), None
     try:
         intrinsics = read_matrices(folder / "intri.npy", (3, 3))
     except InputError as error:
         logger.warning("%s The poses stay unknown.", error)
         return None, None, {"poses": "unknown: no intrinsics"}
     intrinsics[:2] *= info.height / ROWS
+    path = next((folder / name for name in POSES if (folder / name).exists()), None)
+    if path is None:
+        none = f"{quote_path(folder)} has none of {', '.join(POSES)}"
+        logger.warning("%s. The poses stay unknown.", none)
+        return None, intrinsics, {"poses": "unknown: none"}
+    matrices = read_matrices(path, (None, 4, 4))
+    rows, other = np.arange(min(frames, len(matrices))), None
     try:
         rows = pair_rows(video, info, len(matrices), what="poses", frames=frames)
     except InputError:

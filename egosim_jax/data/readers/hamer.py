@@ -7,19 +7,23 @@ The keypoints describe a right hand in meters, in our order, without its positio
 mirrored in x. `cam_t_full` is the hand's position in HaMeR's camera: its focal length is 5000 / 256
 of the image's longer side, and its principal point is the image center, counted from the corner.
 The recording has another camera, so the hand is moved until that camera sees it at the same pixels,
-by linear least squares. If a side has several hands, the most confident one is used.
+by linear least squares. If a side has several hands, the most confident one is used. EgoSim's
+script lists every frame, also without hands: a list from 0 without gaps has the video's length.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from egosim_jax.data.pairing import alike
 from egosim_jax.geometry import transform
 from egosim_jax.io.bounded import quote, quote_path, read_json
+from egosim_jax.io.video import VideoInfo
 from egosim_jax.types import Cameras, InputError
 
 FOCAL = 5000 / 256
@@ -28,19 +32,21 @@ MAX_BYTES = 1 << 28
 """Maximum size of a file in bytes."""
 
 
-def read_hamer(path: Path, cameras: Cameras, frames: int) -> Float[np.ndarray, "f 2 21 3"]:
+def read_hamer(path: Path, cameras: Cameras, info: VideoInfo) -> Float[np.ndarray, "f 2 21 3"]:
     """Return joints in the world, left before right, NaN where there is no hand.
 
     Hands of frames without a camera are omitted. Raises `InputError` if the file is not HaMeR's,
-    or names frames that the video, of the length `frames`, does not have.
+    names frames that the video does not have, or lists frames at another rate than the video's.
     """
     written = read_json(path, limit=MAX_BYTES)
     entries = written.get("frames") if isinstance(written, dict) else None
     if not isinstance(entries, list):
         raise InputError(f"{quote_path(path)} has no frames: it is not a result of HaMeR.")
     count = len(cameras.world_from_camera)
+    frames = max(count, len(info.timeline.listed_s))
     joints = np.full((count, 2, 21, 3), np.nan)
     best = np.full((count, 2), -np.inf)
+    numbers: list[int] = []
     for entry in entries:
         number = entry.get("frame_idx") if isinstance(entry, dict) else None
         hands = entry.get("hands") if isinstance(entry, dict) else None
@@ -49,13 +55,29 @@ def read_hamer(path: Path, cameras: Cameras, frames: int) -> Float[np.ndarray, "
                 f"{quote_path(path)}: frame {quote(number)} with hands {quote(hands)}: frame_idx "
                 f"must be from 0 to {frames - 1}. Run HaMeR on the same video."
             )
+        numbers.append(number)
         for hand in hands if number < count else ():
             side, confidence, points, position = _hand(hand, path)
             if confidence > best[number, side]:
                 best[number, side] = confidence
                 local = place_hand(points, position, cameras)
                 joints[number, side] = transform(cameras.world_from_camera[number], local)
+    _check_rate(path, numbers, info)
     return joints
+
+
+def _check_rate(path: Path, numbers: Sequence[int], info: VideoInfo) -> None:
+    """Raise `InputError` for a list of all frames, from 0, that has another length than a video."""
+    rows = len(numbers)
+    lengths = (info.frames, len(info.timeline.listed_s))
+    if set(numbers) != set(range(rows)) or any(alike(rows, length) for length in lengths):
+        return
+    rate = float(info.fps) * rows / info.frames
+    raise InputError(
+        f"{quote_path(path)} lists {rows} frames, and the video has {info.frames}, as at "
+        f"{rate:.4g} frames per second instead of {float(info.fps):.4g}: frame_idx must be the "
+        "number of the frame. Run HaMeR on the same video."
+    )
 
 
 def place_hand(

@@ -151,9 +151,12 @@ def _read(
         )  # fmt: skip
     times_s = times_s[fits]
     start = _consecutive(info, times_s)
-    tasks = episode.tasks
-    if tasks is None:
-        tasks = read_texts(episode.data).get(episode.index, ()) if episode.data else ()
+    tasks = episode.tasks or ()
+    if episode.tasks is None and episode.data:
+        try:
+            tasks = read_texts(episode.data).get(episode.index, ())
+        except InputError as error:
+            logger.warning("Episode %d: its tasks stay unknown: %s", episode.index, error)
     return Recording(
         recording_id=f"episode_{episode.index:06d}",
         video=episode.video,
@@ -344,7 +347,7 @@ def _episodes_v3(root: Path, info: Mapping[str, Any], camera: str) -> Iterator[_
 
 def _tasks_of_rows(root: Path, path: Path) -> dict[int, tuple[str, ...]]:
     """Return the texts of each episode's tasks, in the order of its rows in a table."""
-    rows, texts = read_parquet(path, ["episode_index", "task_index"]), read_tasks(root)
+    texts, rows = read_tasks(root), read_parquet(path, ["episode_index", "task_index"])
     used: dict[int, dict[int, None]] = {}
     for episode, task in zip(rows["episode_index"], rows["task_index"], strict=True):
         used.setdefault(episode, {})[task] = None

@@ -111,21 +111,24 @@ def _read(path: Path, folder: Path) -> Recording:
         metadata = _read_metadata(names, read, path)
         matches = filter(None, map(_IMAGE.fullmatch, sorted(names)))
         numbered = {int(match[1]): match[0] for match in matches}  # rgbd/ rather than rgb/
+        count = max(numbered, default=-1) + 1
         poses = _poses(metadata, path)
-        if not numbered or max(numbered) >= len(poses):
+        posed = count if poses is None else len(poses)
+        if not 0 < count <= posed:
             raise InputError(
-                f"{quote_path(path)} has {len(numbered)} images and {len(poses)} poses: the "
-                "images must be numbered from 0, one per pose. Export the capture again."
+                f"{quote_path(path)} has {len(numbered)} images and {posed} poses: the images must "
+                "be numbered from 0, one per pose. Export the capture again."
             )
-        lens, spread = _lens(metadata, len(poses), path)
-        rigid, numbers = is_rigid(poses), sorted(numbered)[:MAX_IMAGES]
+        lens, spread = _lens(metadata, posed, path)
+        rigid = np.ones(posed, bool) if poses is None else is_rigid(poses)
+        numbers = sorted(numbered)[:MAX_IMAGES]
         used = dict(zip((numbered[number] for number in numbers), rigid[numbers], strict=True))
         run = longest_run(list(used), used.__getitem__)
         notes = describe_run(list(used), run)
         if run:  # without a pose, the recording names the first
             numbers = [numbers[index] for index in run]
         numbers, fps = _moments(metadata, numbers, path)
-        poses = poses[numbers]
+        poses = None if poses is None else poses[numbers]
         images = (
             decode_image(read(name), name=quote_text(name), pixels="stored")
             for name in map(numbered.__getitem__, numbers)
@@ -141,7 +144,7 @@ def _read(path: Path, folder: Path) -> Recording:
         width=video.width,
         world_from_camera=poses,
         intrinsics_px=video.intrinsics_px if np.isfinite(spread) else None,
-        metric=True,
+        metric=poses is not None,
         depth=depth,
         provenance={"focal_spread": f"{spread:.4f}", "depth": why, **notes},
     )
@@ -208,7 +211,11 @@ def _number(metadata: dict[str, Any], name: str, path: Path) -> float:
     return float(value)
 
 
-def _poses(metadata: dict[str, Any], path: Path) -> np.ndarray:
+def _poses(metadata: dict[str, Any], path: Path) -> np.ndarray | None:
+    """Return camera poses, or None for a capture without them, which tracked nothing."""
+    if not metadata.get("poses"):
+        logger.warning("%s has no poses: its cameras stay unknown", quote_path(path))
+        return None
     table = _numbers(metadata, "poses", 7, path)
     return make_poses(table[:, :4], table[:, 4:]) @ OPENCV_FROM_OPENGL
 

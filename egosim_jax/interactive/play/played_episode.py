@@ -243,8 +243,8 @@ class PlayedEpisode:
         if not self.at:
             return []
         before, after = (self.moments[n].start.state for n in (self.at - 1, self.at))
-        moved = moved_objects(before, after)
-        return [*self.session.result.info["notes"], *map(str, moved)]
+        notes = self.session.result.info["notes"]
+        return [*notes, *map(str, moved_objects(before, after, notes))]
 
     def go_to(self, number: int) -> None:
         """Return to a moment; the next clip continues from there."""

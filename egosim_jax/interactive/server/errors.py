@@ -6,7 +6,7 @@ import errno
 import os
 from typing import Any
 
-from egosim_jax.runtime.command import system_error
+from egosim_jax.runtime.failures import system_error
 from egosim_jax.types import InputError
 
 STORAGE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES)

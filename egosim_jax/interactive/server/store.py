@@ -333,7 +333,8 @@ class Store:
             if refusal.code == "internal":
                 traceback.print_exc()
             if refusal.code == "storage":
-                print(f"cannot write to {self.folder}: {refusal}", file=sys.stderr, flush=True)
+                text = printable(f"cannot write to {self.folder}: {refusal}")
+                print(text, file=sys.stderr, flush=True)
             raise refusal from error
         finally:
             with self._changing:

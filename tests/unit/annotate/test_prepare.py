@@ -110,6 +110,16 @@ def test_ids_are_unique_names(tmp_path):
         find_sources([tmp_path / "empty"])
 
 
+def test_no_video_in_a_folder_is_passed_over_whatever_its_suffix(tmp_path):
+    video = write(tmp_path / "made.mkv", textured_video(9)).read_bytes()
+    suffixes = [".ts", ".m4v", ".MTS", ".m2ts", ".MOV", ".3gp", ".WebM", ".avi", ".wmv", ".MPG"]
+    for number, suffix in enumerate(suffixes):
+        (tmp_path / "set").mkdir(exist_ok=True)
+        (tmp_path / "set" / f"take_{number}{suffix}").write_bytes(video)
+    (tmp_path / "set/notes.txt").touch()
+    assert [s.path.suffix for s in find_sources([tmp_path / "set"])] == suffixes
+
+
 def test_videos_of_one_name_take_their_folders(tmp_path):
     frames = textured_video(9)
     for name in ("x/take.mp4", "y/take.mp4"):

@@ -236,6 +236,29 @@ def test_pipes_are_named_and_hidden_folders_skipped(video, tmp_path):
     assert "No such file" in videos["missing"]["problem"]
 
 
+@pytest.mark.parametrize("member", ["a video", "a link", "a folder above"])
+def test_a_name_that_is_not_utf8_is_reported_and_the_others_are_annotated(video, tmp_path, member):
+    name, place = os.fsdecode(b"caf\xe9"), tmp_path / "set"
+    place.mkdir()
+    video.rename(place / "cup.mp4")
+    odd = write(tmp_path / "odd.mp4", textured_video(17, seed=3))
+    if member == "a folder above":
+        (place / name).mkdir()
+        odd.rename(place / name / "odd.mp4")
+    elif member == "a link":
+        odd.rename(tmp_path / f"{name}.mp4")
+        (place / "odd.mp4").symlink_to(tmp_path / f"{name}.mp4")
+    else:
+        odd.rename(place / f"{name}.mp4")
+    for _ in range(2):
+        report = annotate([place], tmp_path / "out")
+        assert report["clips"]["done"] == 1
+        (problem,) = [about["problem"] for about in report["videos"].values() if "problem" in about]
+        assert "caf\\udce9" in problem
+        assert "convmv" in problem
+    assert read_json(tmp_path / "out/report.json") == report
+
+
 def test_a_defect_is_reported_for_its_clip_alone_and_tried_again(video, tmp_path, monkeypatch):
     out = tmp_path / "out"
     write(tmp_path / "dish.mp4", textured_video(17, seed=3))

@@ -43,6 +43,9 @@ def test_numbered_files_and_files_of_an_index_are_one_checkpoint(tmp_path):
     assert found.keys() == {"odd", "model", "other.pth"}
     assert found["odd"].tensors.keys() == found["model"].tensors.keys() == {"a", "b"}
     assert found["model"].bytes == 20
+    for number in (1, 2):
+        (whole,) = sources(tmp_path / f"model-{number:05d}-of-00002.safetensors")
+        assert (whole.name, whole.files) == ("model", found["model"].files)
     (tmp_path / "odd_2.safetensors").unlink()
     with pytest.raises(InputError, match="odd_2"):
         list(sources(tmp_path))
@@ -50,6 +53,24 @@ def test_numbered_files_and_files_of_an_index_are_one_checkpoint(tmp_path):
     (tmp_path / "model-00001-of-00002.safetensors").unlink()
     with pytest.raises(InputError, match="1 of the 2 files of model"):
         list(sources(tmp_path))
+    (alone,) = sources(tmp_path / "model-00002-of-00002.safetensors")
+    assert [*alone.tensors] == ["b"]
+
+
+@pytest.mark.parametrize("indexed", [False, True])
+def test_files_next_to_a_single_one_are_chosen_by_the_path_in_the_refusal(tmp_path, indexed):
+    save_file({"visual.cls_embedding": torch.rand(1)}, tmp_path / "model.safetensors")
+    names = ["visual.cls_embedding", "other"]
+    files = [f"x-{number:05d}-of-00002.safetensors" for number in (1, 2)]
+    for file, name in zip(files, names, strict=True):
+        save_file({name: torch.rand(1)}, tmp_path / file)
+    if indexed:
+        places = json.dumps({"weight_map": dict(zip(names, files, strict=True))})
+        (tmp_path / "x.safetensors.index.json").write_text(places, encoding="utf-8")
+    path = "x.safetensors.index.json" if indexed else files[0]
+    with pytest.raises(InputError, match=rf"\({path}, model\.safetensors\)|, {path}\)"):
+        detect(tmp_path).network("image")
+    assert detect(tmp_path / path).network("image").tensors.keys() == {*names}
 
 
 def test_a_file_is_read_by_its_first_bytes(tmp_path):

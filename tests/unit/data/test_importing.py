@@ -1,5 +1,6 @@
 """Imports resume, keep what other sources wrote, and name what they skip."""
 
+import os
 import shutil
 from contextlib import suppress
 from dataclasses import dataclass
@@ -96,6 +97,30 @@ def test_a_refused_or_interrupted_recording_leaves_nothing(tmp_path, error):
     with suppress(KeyboardInterrupt):
         assert run(Failing(names=(), read=[]), tmp_path)[0].problem == "refused"
     assert [path.name for path in tmp_path.iterdir()] == [".lock"]
+
+
+@pytest.mark.parametrize("member", ["the source", "its folder", "a link", "the video"])
+def test_a_name_that_is_not_utf8_is_skipped_and_the_others_are_imported(tmp_path, member):
+    name, place = os.fsdecode(b"caf\xe9"), tmp_path / "set"
+    odd = {"its folder": place / name / "b", "the source": place / name}.get(member, place / "b")
+
+    class Odd(Listed):
+        def find(self):
+            yield from super().find()
+            video = Path(f"/{name}.mp4" if member == "the video" else "/v.mp4")
+            made = Recording(
+                recording_id="b", video=video, frames=5, fps=Fraction(30), height=8, width=8
+            )
+            yield Entry(recording_id="b", read=lambda folder: made, source=odd)
+
+    if member == "a link":
+        (tmp_path / name).mkdir()
+        place.mkdir()
+        odd.symlink_to(tmp_path / name)
+    good, bad = run(Odd(names=("a",), read=[]), tmp_path / "out")
+    assert good.problem is None
+    assert "caf\\udce9" in bad.problem
+    assert [path.name for path in (tmp_path / "out").iterdir() if path.is_dir()] == ["a"]
 
 
 def test_a_folder_with_other_files_is_not_replaced(tmp_path):

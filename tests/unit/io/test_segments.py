@@ -68,8 +68,11 @@ def test_frames_beyond_the_end_are_refused(tmp_path):
         read_video(path, start=35, stop=41, whole=True)
 
 
-def test_a_file_without_an_index_that_is_cut_off_is_refused_by_the_length_in_its_header(tmp_path):
-    path = write(tmp_path / "video.mkv")
+@pytest.mark.parametrize(("suffix", "codec"), [("mkv", "libx264"), ("webm", "libsvtav1")])
+def test_a_file_without_an_index_that_is_cut_off_is_refused_by_the_length_in_its_header(
+    tmp_path, suffix, codec
+):
+    path = write(tmp_path / f"video.{suffix}", codec=codec)
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
     for read in (probe_video, read_video):

@@ -1,5 +1,6 @@
 """Behavior of every command line: version, suggestions, errors in one line."""
 
+import ast
 import dataclasses
 import errno
 import os
@@ -20,7 +21,7 @@ from egosim_jax.cli.generate import Generate
 from egosim_jax.cli.simulate import Simulate
 from egosim_jax.convert.__main__ import main as convert
 from egosim_jax.io.atomic import lock_folder
-from egosim_jax.runtime import command, interrupts
+from egosim_jax.runtime import command, failures, interrupts
 from egosim_jax.train.__main__ import main as train
 from egosim_jax.train.config import TrainConfig
 from egosim_jax.train.recipes import RECIPES
@@ -94,7 +95,7 @@ def test_a_missing_extra_is_found_before_anything_starts(extra, tmp_path, monkey
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("code", command.REFUSALS)
+@pytest.mark.parametrize("code", failures.REFUSALS)
 def test_an_error_of_the_system_is_one_line_with_a_fix(code, capsys):
     def run():
         raise OSError(code, command.os.strerror(code), "/some/where")
@@ -103,7 +104,7 @@ def test_an_error_of_the_system_is_one_line_with_a_fix(code, capsys):
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert said.startswith("error: /some/where: ")
-    assert command.REFUSALS[code] in said
+    assert failures.REFUSALS[code] in said
 
 
 def test_a_library_that_hides_the_systems_reason_in_its_text_is_understood(capsys):
@@ -207,6 +208,82 @@ def test_a_path_that_is_not_utf8_is_refused_with_a_way_to_rename_it(words, capsy
     assert "caf\\udce9/metadata.csv" in error
     assert "convmv" in error
     assert "Traceback" not in error
+
+
+@pytest.mark.parametrize("through", ["the current folder", "a link", "a folder above"])
+def test_a_path_that_leads_to_a_name_that_is_not_utf8_is_refused(
+    through, tmp_path, monkeypatch, capsys
+):
+    (place := tmp_path / os.fsdecode(b"caf\xe9")).mkdir()
+    (tmp_path / "link").symlink_to(place)
+    monkeypatch.chdir(place if through != "a link" else tmp_path)
+    if through == "a folder above":
+        (place / "below").mkdir()
+        monkeypatch.chdir("below")
+    out = "link" if through == "a link" else "out"
+    assert egosim(["data", "make", "tabletop", "--scenes", "1", "--out", out]) == 2
+    error = capsys.readouterr().err
+    assert "caf\\udce9" in error
+    assert "convmv" in error
+    assert not any(place.rglob("out"))
+
+
+def test_a_library_that_cannot_take_a_name_is_no_bug(capsys):
+    def run():
+        try:
+            f"{'a' * 1000}/caf\udce9/{'b' * 1000}".encode()
+        except UnicodeEncodeError as error:
+            raise RuntimeError("of a library") from error
+
+    assert command.run_with_exit_codes(run) == 2
+    error = capsys.readouterr().err
+    assert "caf\\udce9" in error
+    assert len(error) < 400
+
+
+HOSTILE = "a\x1b[31mb\x07\u202ec"
+"""Name that would color a terminal, ring its bell and write backwards."""
+
+
+def test_no_name_reaches_the_terminal_raw(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    made = ["data", "make", "tabletop", "--scenes", "1", "--frames", "5", "--workers", "1"]
+    made += ["--height", "32", "--width", "48", "--out", f"{HOSTILE}.shards"]
+    assert egosim(made) == 0
+    assert egosim(["data", "look", "--shards", f"{HOSTILE}.shards", "--out", f"{HOSTILE}.png"]) == 0
+    assert egosim(["data", "check", "--shards", f"{HOSTILE}.shards"]) == 0
+    assert egosim(["data", "stats", "--shards", f"{HOSTILE}.shards"]) == 0
+    assert egosim(["view", f"{HOSTILE}.ply"]) == 2
+    said = capsys.readouterr()
+    assert said.out.startswith("a\\x1b[31mb\\x07\\u202ec.shards\n")
+    assert not {*"\x1b\x07\u202e"} & {*said.out, *said.err}
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
+def test_stdout_of_any_encoding_gets_all_text(tmp_path, encoding):
+    code = "import sys; from egosim_jax.runtime.command import run_with_exit_codes as run; "
+    code += "from egosim_jax.runtime.terminal import print_line; "
+    code += "sys.exit(run(lambda: print(sys.argv[1]) or print_line(sys.argv[1]) or 0))"
+    ran = subprocess.run(
+        [sys.executable, "-c", code, "日本 Ω"], capture_output=True,
+        env=os.environ | {"PYTHONIOENCODING": f"{encoding}:strict"},
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr
+    shown = "日本 Ω".encode(encoding, "backslashreplace") + b"\n"
+    assert ran.stdout == 2 * shown
+
+
+def test_paths_are_printed_by_the_function_that_escapes_them():
+    """`print` gets no variable by itself on stdout: it may be a path."""
+    raw = []
+    for top in ("egosim_jax", "train", "convert"):
+        for path in (ROOT / top).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+                name = getattr(getattr(node, "func", None), "id", None)
+                if name == "print" and "file" not in [word.arg for word in node.keywords]:
+                    kinds = (ast.Name, ast.Attribute, ast.BinOp)
+                    raw += [ast.unparse(node) for a in node.args if isinstance(a, kinds)]
+    assert raw == ["print(START)"]
 
 
 def test_a_command_that_writes_a_file_replaces_one(tmp_path, monkeypatch, capsys):

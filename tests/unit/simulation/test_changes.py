@@ -8,6 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from egosim_jax.simulation.changes import moved_objects
 from egosim_jax.types import SceneState
+from tests.unit.perception.clip.test_object_motion import FRAMES, carry, film, gripper, make_state
+from tests.unit.perception.clip.test_object_motion import track as observe
 
 CENTER = np.array([0.3, 0.1, 0.5])
 
@@ -70,3 +72,18 @@ def test_objects_have_their_names_and_the_order_of_their_ids():
     first, second = moved_objects(scene(), end)
     assert str(first) == "green cone: moved by 20 mm, turned by 0 degrees, and is released"
     assert (second.object_id, second.name, second.held) == (2, "object 2", False)
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_what_a_hand_may_have_held_is_not_called_released(held):
+    """Perception's own note says so, of the same object only."""
+    state, path = make_state((0, 0)), carry((0, 0), (0, 0, 0.1))
+    frames = film(state, {1: path - path[0]})
+    path[:4, 2] += [0.12, 0.08, 0.04, 0]
+    notes = observe(state, [gripper(path, np.full(FRAMES, 0.036))], frames).notes
+    start = replace(scene(), names={1: "red cube 1", 2: "red cube 11"})
+    end = replace(moved(start, 1, turn(0, CENTER, (0.061, 0, 0))), held={0: 1} if held else {})
+    end = moved(end, 2, turn(0, CENTER, (0, 0, 0.01)))
+    first, second = moved_objects(start, end, notes)
+    assert str(first).endswith("and is held" if held else "and may still be held")
+    assert str(second).endswith("and is released")

@@ -171,6 +171,60 @@ def test_depth_files_are_found_by_frame(world, tmp_path, imported):
     assert recording.read_depth(3)[0, 0] == pytest.approx(0.8)
 
 
+CALIBRATION = {
+    "no intrinsics": ("intrinsic_params", None),
+    "empty intrinsics": ("intrinsic_params", {"intrinsic": {}}),
+    "no extrinsics": ("extrinsic_params_aligned", None),
+    "empty extrinsics": ("extrinsic_params_aligned", []),
+}
+
+
+@pytest.mark.parametrize("member", CALIBRATION)
+@pytest.mark.parametrize("lens", [COEFFICIENTS, COEFFICIENTS | {"k1": -0.2}])
+def test_a_missing_calibration_stays_unknown_and_the_rest_is_read(
+    world, tmp_path, imported, caplog, member, lens
+):
+    name, content = CALIBRATION[member]
+    write_episode(tmp_path / "set", world, lens=lens)
+    path = next(tmp_path.rglob(f"head_{name}.json"))
+    path.unlink() if content is None else path.write_text(json.dumps(content))
+    (depth := tmp_path / "set/observations/327/648642/depth").mkdir()
+    image = np.full((world.height, world.width), 500, np.uint16)
+    cv2.imwrite(str(depth / "head_depth_000006.png"), image)
+    done, problems = imported(AgiBot(source=tmp_path / "set"))
+    assert not problems
+    recording = done["327_648642_001"]
+    assert (recording.caption, recording.frames) == ("Place the cup", 7)
+    assert (recording.world_from_camera, recording.joints_m) == (None, None)
+    assert not recording.metric
+    assert (recording.intrinsics_px is None) == ("intrinsics" in member)
+    assert recording.provenance["extrinsics"].startswith("unknown: no")
+    assert "poses and grippers are unknown" in caplog.text
+    if recording.video.name == "head_color.mp4":
+        assert recording.read_depth(1)[0, 0] == pytest.approx(0.5)
+
+
+def test_without_intrinsics_the_user_can_choose_the_reading(world, tmp_path, imported):
+    write_episode(tmp_path / "set", world)
+    next(tmp_path.rglob("head_intrinsic_params.json")).unlink()
+    reader = AgiBot(source=tmp_path / "set", extrinsics="camera_to_base")
+    recording = imported(reader)[0]["327_648642_001"]
+    np.testing.assert_allclose(recording.world_from_camera, world.poses[5:], atol=1e-9)
+    assert recording.metric
+    assert recording.intrinsics_px is None
+    assert recording.joints_m.shape == (7, 2, 3, 3)
+
+
+def test_without_openings_the_cameras_are_read(world, tmp_path, imported):
+    write_episode(tmp_path / "set", world)
+    with h5py.File(next(tmp_path.rglob("*.h5")), "a") as file:
+        del file["state/effector"]
+    recording = imported(AgiBot(source=tmp_path / "set"))[0]["327_648642_000"]
+    assert recording.joints_m is None
+    assert recording.provenance["hands"] == "unknown: no openings"
+    np.testing.assert_allclose(recording.world_from_camera, world.poses[:5], atol=1e-9)
+
+
 def test_damaged_episodes_are_named(world, tmp_path, imported, caplog):
     for number in range(4):
         write_episode(tmp_path / "set", world, episode=str(number), parts=False)

@@ -79,6 +79,47 @@ def test_poses_of_another_rate_are_refused(world, tmp_path, imported):
     assert "ffmpeg -i IN -vf fps=8 OUT" in problem
 
 
+def test_a_clip_without_poses_keeps_video_and_caption(world, tmp_path, imported, caplog):
+    target = write_clip(tmp_path / "fold_1", world)
+    write_hands(tmp_path / "fold_1", world)
+    for path in target.glob("extrinsics_*.npy"):
+        path.unlink()
+    recording = imported(EgoSimClips(source=tmp_path / "fold_1"))[0]["fold_1"]
+    assert (recording.world_from_camera, recording.joints_m) == (None, None)
+    assert recording.caption == "A person folds a towel."
+    assert recording.frames == world.frames
+    world.assert_first(recording)
+    assert "cameras and hands stay unknown" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("change", "fps"),
+    [
+        (lambda frames: frames[:6], 8),
+        (lambda frames: frames[:9], 12),
+        (lambda frames: [*frames[:5], {"frame_idx": 5, "hands": []}], 8),
+        (lambda frames: frames[:11], None),
+        (lambda frames: frames[::2], None),
+        (lambda frames: frames[4:8], None),
+        (lambda frames: [f for f in frames if f["frame_idx"] != 3], None),
+    ],
+)
+def test_hands_of_another_rate_are_refused(world, tmp_path, imported, change, fps):
+    """A list of all frames has the video's length; a list of the frames with hands has gaps."""
+    write_clip(tmp_path / "fold_1", world)
+    write_hands(tmp_path / "fold_1", world)
+    path = tmp_path / "fold_1/_proc/mano_full/video.json"
+    frames = change(json.loads(path.read_text())["frames"])
+    path.write_text(json.dumps({"video_id": "video", "frames": frames}))
+    done, problems = imported(EgoSimClips(source=tmp_path / "fold_1"))
+    if fps is not None:
+        assert f"as at {fps} frames per second instead of 16" in problems["fold_1"]
+        assert "Run HaMeR on the same video" in problems["fold_1"]
+        return
+    found = np.isfinite(done["fold_1"].joints_m).all(axis=(1, 2, 3))
+    assert np.flatnonzero(found).tolist() == [frame["frame_idx"] for frame in frames]
+
+
 def write_hands(folder, world, **changes):
     """HaMeR's result for the scene's hands, in its own camera of another focal length."""
     focal = 5000 / 256 * max(world.width, world.height)

@@ -95,6 +95,16 @@ def test_poses_without_intrinsics_stay_unknown(plane, tmp_path, imported, damage
     assert recording.names == ("onion", "knife")
 
 
+def test_without_poses_the_rest_is_read(plane, tmp_path, imported, caplog):
+    video_id = write_set(tmp_path / "set", plane)
+    (tmp_path / f"set/poses/{video_id}/fused_pose.npy").unlink()
+    recording = imported(EgoVid(source=tmp_path / "set"))[0][video_id]
+    assert (recording.world_from_camera, recording.frames) == (None, 20)
+    assert recording.caption == "The wearer cuts an onion, slowly."
+    np.testing.assert_allclose(recording.intrinsics_px, plane.intrinsics, atol=1e-9)
+    assert "The poses stay unknown" in caplog.text
+
+
 def test_a_span_of_a_long_video_is_taken(world, tmp_path, imported):
     write_set(tmp_path / "set", world, video=UUID, span=(3, 9), poses=world.poses[:2])
     recording = imported(EgoVid(source=tmp_path / "set"))[0][f"{UUID}_3_9"]

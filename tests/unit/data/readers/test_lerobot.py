@@ -101,6 +101,15 @@ def test_an_episode_without_a_table_has_no_task(world, tmp_path, imported):
     assert not problems
 
 
+def test_without_the_table_of_tasks_the_rest_is_read(world, tmp_path, imported, caplog):
+    write_v3(tmp_path / "set", world, tasks=False)
+    (tmp_path / "set/meta/tasks.parquet").unlink()
+    done, problems = imported(LeRobot(source=tmp_path / "set"))
+    assert not problems
+    assert {recording.caption for recording in done.values()} == {None}
+    assert "its tasks stay unknown" in caplog.text
+
+
 def test_both_forms_of_tasks_are_read(tmp_path):
     (tmp_path / "meta").mkdir()
     path = tmp_path / "meta/tasks.parquet"

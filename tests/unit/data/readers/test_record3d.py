@@ -122,6 +122,17 @@ def test_without_a_matrix_intrinsics_are_unknown(world, tmp_path, imported):
     np.testing.assert_allclose(recording.world_from_camera, world.poses, atol=1e-9)
 
 
+@pytest.mark.parametrize("poses", [None, []])
+def test_without_poses_images_intrinsics_and_depth_are_read(world, tmp_path, imported, poses):
+    write_capture(tmp_path / "scan.r3d", world, poses=poses)
+    recording = imported(Record3D(source=tmp_path))[0]["scan"]
+    assert recording.world_from_camera is None
+    assert not recording.metric
+    world.assert_first(recording)
+    np.testing.assert_allclose(recording.intrinsics_px, world.intrinsics, atol=1e-9)
+    assert recording.read_depth(3)[-1, -1] == pytest.approx(0.8)
+
+
 @pytest.mark.parametrize(
     ("data", "message"),
     [
