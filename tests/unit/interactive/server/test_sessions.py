@@ -1,5 +1,6 @@
 """Sessions of a painted world: journal, resumption, limits, isolation."""
 
+import json
 import shutil
 from dataclasses import replace
 
@@ -182,11 +183,16 @@ def test_a_damaged_session_does_not_disturb_the_others(store, tmp_path):
     again.close()
 
 
-def test_a_damaged_save_is_refused_without_the_paths_of_the_server(store):
+@pytest.mark.parametrize(
+    "fields", [None, {"row": [1, [2]]}, {"past": [3]}, {"height": 10**9}, {"row": [10**400]}]
+)
+def test_a_damaged_save_is_refused_without_the_paths_of_the_server(store, fields):
     made = store.create({"seed": 3})
     store.save({"session": made.id, "name": "a"}).result()
-    (made.folder / "saved" / "a" / "start.json").write_text("{")
-    with pytest.raises(RequestError, match=r"start\.json") as refused:
+    start = made.folder / "saved" / "a" / "start.json"
+    old = start.read_text()
+    start.write_text("{" if fields is None else json.dumps({**json.loads(old), **fields}))
+    with pytest.raises(RequestError, match=r"start|frames of") as refused:
         store.load({"session": made.id, "name": "a"}).result()
     assert (refused.value.status, str(store.folder) in str(refused.value)) == (422, False)
     assert step(store, made, 1).step_id == 1
