@@ -212,6 +212,7 @@ def make_frames(folder: Path) -> None:
 def read_frames(folder: Path) -> Any:
     """Send the frames and then a request; the server replies, closes, or waits for the rest."""
     service, port, errors = _server()
+    errors.clear()
     if SESSION not in service.store.sessions:
         service.store.create({"session": SESSION, "seed": 3})
     before, last = _internal(service), frame(wire.pack({"request": "status"}))
@@ -222,9 +223,7 @@ def read_frames(folder: Path) -> Any:
         with suppress(OSError):
             client.sendall((folder / "client.bin").read_bytes() + last)
         _listen(client, service)
-    logged = "\n".join(errors)
-    errors.clear()
-    assert not logged, logged
+    assert not errors, "\n".join(errors)
     assert _internal(service) == before, "an internal error"
     for name in set(service.store.sessions) - {SESSION}:
         service.store.remove({"session": name}).result()

@@ -51,12 +51,14 @@ def stop_after(limit_s):
 
 def change(target, sample, folder, case):
     """Change one file of a copy, or its folder; return the kind of change."""
-    mutate = case.choice(BYTES + (target.mutations + target.rearrangements) * 2)
-    if mutate in target.rearrangements:
-        mutate(folder, case)
-        return mutate.__name__
+    moves, kinds = target.rearrangements * 2, BYTES + target.mutations * 2
+    if moves and case.random() < len(moves) / (len(moves) + len(kinds)):
+        rearrange = case.choice(moves)
+        rearrange(folder, case)
+        return rearrange.__name__
     files = sorted({f for glob in target.files for f in sample.glob(glob) if f.is_file()})
     file = folder / case.choice(files).relative_to(sample)
+    mutate = case.choice(kinds)
     changed = mutate(file.read_bytes(), case)
     file.write_bytes(case.choice(BYTES)(changed, case) if case.random() < 0.1 else changed)
     return mutate.__name__

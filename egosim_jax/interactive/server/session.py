@@ -36,7 +36,7 @@ from egosim_jax.interactive.server import wire
 from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.interactive.server.requests import request_hash
 from egosim_jax.io.atomic import atomic_folder
-from egosim_jax.io.bounded import check_inside, quote, quote_path, read_json
+from egosim_jax.io.bounded import check_inside, only_inside, quote, quote_path, read_json
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.run import plain, write_json
 from egosim_jax.simulation.rollout import RecordedClip, Rollout, load_clip
@@ -139,7 +139,8 @@ class Session:
 
     def _load_start(self, folder: Path) -> Start:
         """Read a start. Raises `InputError` if it is damaged, or of another frame size."""
-        start = Start.load(folder)
+        with only_inside([self.folder]):
+            start = Start.load(folder)
         check_size(start, self.backend.video)
         return start
 
@@ -214,7 +215,11 @@ class Session:
 
     def load_result(self, number: int) -> Result:
         """Read the result of a committed step."""
-        folder, action = self._step(number), self.action(number)
+        with only_inside([self.folder]):
+            return self._load_result(number, self.action(number))
+
+    def _load_result(self, number: int, action: Action) -> Result:
+        folder = self._step(number)
         clip = folder / "rollout" / "clip_1"
         info = read_json(folder / INFO)
         if not isinstance(info, dict):

@@ -198,6 +198,20 @@ def test_a_damaged_save_is_refused_without_the_paths_of_the_server(store, fields
     assert step(store, made, 1).step_id == 1
 
 
+@pytest.mark.parametrize("file", ["saved/a/first_frame.png", "starts", "steps/1/info.json"])
+def test_links_out_of_a_session_are_not_followed(store, tmp_path, file):
+    made = store.create({"session": "one"})
+    store.save({"session": "one", "name": "a"}).result()
+    step(store, made, 1)
+    store.close()
+    (made.folder / file).rename(tmp_path / "secret")
+    (made.folder / file).symlink_to(tmp_path / "secret")
+    again = Store(store.folder, painted(), Limits())
+    with pytest.raises(RequestError, match="is a link to a file outside"):
+        again.load({"session": "one", "name": "a"}).result()
+    again.close()
+
+
 def test_a_store_that_closes_at_once_gives_up_what_waits(tmp_path, monkeypatch):
     store = Store(tmp_path, painted(pause=0.3), Limits(threads=1))
     one, two = (store.create({"session": name}) for name in ("one", "two"))
