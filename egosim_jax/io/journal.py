@@ -52,7 +52,7 @@ class Journal:
 
     def _read(self, number: int, entry: Any) -> None:
         chain = entry.pop("chain", None) if isinstance(entry, dict) else None
-        if not _is_entry(entry) or chain != _chained(self._chain, entry):
+        if chain is None or not _is_entry(entry) or chain != _chained(self._chain, entry):
             raise InputError(
                 f"{self._path}, line {number} was changed or is missing. Restore it, or remove "
                 f"{self._folder} to start over."

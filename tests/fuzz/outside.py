@@ -40,7 +40,7 @@ def _folder() -> tempfile.TemporaryDirectory[str]:
 
 @functools.cache
 def _watch() -> int:
-    """Return a descriptor of inotify, which tells of each file of the folder that is opened."""
+    """Return a descriptor of inotify, which reports each file of the folder that is opened."""
     library = ctypes.CDLL(None)
     descriptor = library.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
     assert library.inotify_add_watch(descriptor, os.fsencode(_folder().name), IN_OPEN) >= 0

@@ -87,18 +87,26 @@ def _recorded(path: Path) -> GeneratedWorld:
     """Return a world that renders a recorded session, and does not generate."""
     settings = settings_of(path)
     fields = settings["video"]
-    sizes = {name: fields.get(name) for name in ("frames", "height", "width", "fps")}
-    point_px = settings.get("point_px")
-    for name, value in {**sizes, "point_px": point_px}.items():
-        limit = MAX_POINT_PX if name == "point_px" else MAX_SIZE
-        if type(value) is not int or not 1 <= value <= limit:
-            raise InputError(
-                f"{name} of its settings is {quote(value)}: it must be a whole number from 1 to "
-                f"{limit}. Restore the settings."
-            )
-    video = VideoSpec(**sizes)
+    video = VideoSpec(
+        frames=_size(fields, "frames"),
+        height=_size(fields, "height"),
+        width=_size(fields, "width"),
+        fps=_size(fields, "fps"),
+    )
+    point_px = _size(settings, "point_px", limit=MAX_POINT_PX)
     generator = _Unavailable(renderer=get("jax"), point_px=point_px)
     return GeneratedWorld(generator=generator, video=video, perception=None)
+
+
+def _size(fields: Mapping[str, Any], name: str, *, limit: int = MAX_SIZE) -> int:
+    """Return a size of a session's settings. Raises `InputError` if it is out of bounds."""
+    value = fields.get(name)
+    if type(value) is not int or not 1 <= value <= limit:
+        raise InputError(
+            f"{name} in its settings is {quote(value)}: it must be a whole number from 1 to "
+            f"{limit}. Restore the settings."
+        )
+    return value
 
 
 def _check(session: Session) -> None:
