@@ -68,8 +68,8 @@ def only_inside(sources: Iterable[Path]) -> Iterator[None]:
     A link could bring any file of the user into output that is made of data of others. In a
     cache of the Hugging Face Hub, files are links to the repository's own blobs.
     """
-    folders = {p if p.is_dir() else p.parent for s in sources for p in (s, s.resolve())}
-    folders = {folder.resolve() for folder in folders}
+    folders = {p if p.is_dir() else p.parent for s in sources for p in (s, real_path(s))}
+    folders = {real_path(folder) for folder in folders}
     caches = {p.parent for folder in folders for p in folder.parents if p.name == "snapshots"}
     token = _ROOTS.set((*folders, *caches))
     try:
@@ -78,10 +78,15 @@ def only_inside(sources: Iterable[Path]) -> Iterator[None]:
         _ROOTS.reset(token)
 
 
+def real_path(path: Path) -> Path:
+    """Return a path without links; one in a loop of links, which nothing can open, is kept."""
+    return Path(os.path.realpath(path))  # Path.resolve raises RuntimeError for a loop
+
+
 def check_inside(path: Path) -> None:
     """Raise `InputError` if a path is outside the folders of `only_inside`."""
     roots = _ROOTS.get()
-    if roots and not any(path.resolve().is_relative_to(root) for root in roots):
+    if roots and not any(real_path(path).is_relative_to(root) for root in roots):
         raise InputError(
             f"{quote_path(path)} is a link to a file outside of the source, which is not followed: "
             "put a copy of the file in its place."
@@ -224,7 +229,7 @@ def plot_text(text: str) -> str:
 def own_file(folder: Path, name: str) -> Path | None:
     """Return the path of a regular file in a folder; None if absent, or behind a link out of it."""
     path = folder / name
-    if path.is_file() and path.resolve().is_relative_to(folder.resolve()):
+    if path.is_file() and real_path(path).is_relative_to(real_path(folder)):
         return path
     return None
 

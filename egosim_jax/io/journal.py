@@ -52,7 +52,7 @@ class Journal:
 
     def _read(self, number: int, entry: Any) -> None:
         chain = entry.pop("chain", None) if isinstance(entry, dict) else None
-        if chain is None or chain != _chained(self._chain, entry):
+        if chain is None or not _is_entry(entry) or chain != _chained(self._chain, entry):
             raise InputError(
                 f"{self._path}, line {number} was changed or is missing. Restore it, or remove "
                 f"{self._folder} to start over."
@@ -77,6 +77,15 @@ class Journal:
             raise InputError(
                 f"{self._folder} holds another run (phase {phase} in {NAME}). Choose another "
                 f"folder (--out), or the same inputs: {describe(differing)}."
+            )
+
+    def check_inputs(self, phase: str, made_of: Mapping[str, str]) -> None:
+        """Raise `InputError` unless these inputs of a finished phase are the recorded ones."""
+        recorded = self.done.get(phase, {}).get("made_of", {})
+        if differing := [name for name, value in made_of.items() if recorded.get(name) != value]:
+            raise InputError(
+                f"{self._path}: the {' and '.join(differing)} of phase {quote(phase)} changed "
+                "after it was made. Restore the files."
             )
 
     def phase(
@@ -124,6 +133,13 @@ class Journal:
         self._chain = _chained(self._chain, entry)
         append_line(self._path, {**entry, "chain": self._chain})
         self.done[entry["phase"]] = entry
+
+
+def _is_entry(entry: Any) -> bool:
+    """Return True if a line has the fields of a phase: its chain can be right in any file."""
+    if not isinstance(entry, dict) or not isinstance(entry.get("made_of", {}), dict):
+        return False
+    return isinstance(entry.get("phase"), str)
 
 
 def _chained(chain: str, entry: Any) -> str:

@@ -14,7 +14,7 @@ from typing import Any, no_type_check
 import numpy as np
 from jaxtyping import Float, Int
 
-from egosim_jax.io.bounded import quote_path, refusing
+from egosim_jax.io.bounded import quote, quote_path, refusing
 from egosim_jax.io.untrusted.isolated import read_file
 from egosim_jax.io.untrusted.mjcf import check_files
 from egosim_jax.robots.arms import Arm, Gripper
@@ -32,6 +32,8 @@ MIN_TRAVEL = 0.8
 """Minimum travel of a finger, as a share of the other finger's."""
 MAX_MEMORY, MAX_CPU_S = 1 << 30, 60.0
 """Maximum memory in bytes and processor time in seconds to compile a model."""
+MAX_PARTS = 500
+"""Maximum number of geometries, and of degrees of freedom: kinematics compare them in pairs."""
 RESTORE = "restore the model from the MuJoCo Menagerie. (MENAGERIE_ROOT)"
 """Fix of a model that is not the Menagerie's."""
 
@@ -154,6 +156,7 @@ def make_model(arm: Arm, spec: Any) -> RobotModel:
         _part(spec, "body", prefix + name)
     _part(spec, "body", prefix + arm.gripper.body).add_site(name=GRIP, group=5)
     mj = spec.compile()
+    _check_parts(mj, arm)
     mj.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     joints = [mj.joint(name) for name in arm.joints]
     gripper = [j for j in map(mj.joint, range(mj.njnt)) if j.name not in arm.joints]
@@ -173,6 +176,24 @@ def make_model(arm: Arm, spec: Any) -> RobotModel:
         positions=positions,
         grips_m=grips[:, :3, 3],
     )
+
+
+def _check_parts(mj: Any, arm: Arm) -> None:
+    """Raise `InputError` for too many parts, and for a joint that has more than one position."""
+    mujoco: Any = import_module("mujoco")
+
+    if max(mj.ngeom, mj.nv) > MAX_PARTS:
+        raise InputError(
+            f"The robot's model has {mj.ngeom:,} geometries and {mj.nv:,} degrees of freedom: it "
+            f"may have at most {MAX_PARTS} of each; {RESTORE}"
+        )
+    single = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    for n in range(mj.njnt):
+        if mujoco.mjtJoint(int(mj.jnt_type[n])) not in single:
+            raise InputError(
+                f"The joint {quote(mj.joint(n).name)} of the robot's model is neither a hinge nor "
+                f"a slide, which {arm.title} has; {RESTORE}"
+            )
 
 
 def _sweep(

@@ -12,14 +12,14 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import no_type_check
+from typing import Any, no_type_check
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
 from egosim_jax.io.atomic import atomic_folder
-from egosim_jax.io.bounded import quote, quote_path, read_json
+from egosim_jax.io.bounded import quote, quote_path, read_json, refusing
 from egosim_jax.io.images import read_image
 from egosim_jax.simulation.actions import load_placed, save_placed
 from egosim_jax.simulation.episode import MAX_CLIPS, Episode
@@ -115,12 +115,16 @@ class Start:
                     f"{quote_path(folder / DESCRIPTION)}: {name} is {quote(value)}, not a "
                     f"{kind.__name__}. Restore it."
                 )
-        size = written["height"], written["width"]
         if len(written["past"]) > MAX_CLIPS:
             raise InputError(
                 f"{quote_path(folder)} has more than {MAX_CLIPS} past actions. Restore it."
             )
-        image = folder / FIRST_FRAME
+        with refusing(f"{quote_path(folder)} is not a readable start"):
+            return cls._from(folder, written)
+
+    @classmethod
+    def _from(cls, folder: Path, written: dict[str, Any]) -> Start:
+        size, image = (written["height"], written["width"]), folder / FIRST_FRAME
         return cls(
             state=snapshot.load(folder / "state"),
             camera=Cameras(

@@ -12,6 +12,8 @@ import numpy as np
 
 Mutate = Callable[[bytes, random.Random], bytes]
 """Change a file's bytes."""
+Rearrange = Callable[[Path, random.Random], None]
+"""Change a sample's folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +23,7 @@ class Target:
     A case passes if `read` raises `InputError` with a short message, or gives what it gave of the
     sample, or, where the format has no checksum of ours, gives what `reference` gives of the
     changed file. Everything else is a failure: another exception, another result, more than 1 GiB
-    or 20 s of processor time.
+    or 20 s of processor time, or an opened file of `outside.py`.
     """
 
     name: str
@@ -43,6 +45,8 @@ class Target:
     """Reason that a changed file may be read with another result unnoticed; else empty."""
     mutations: tuple[Mutate, ...] = ()
     """Mutations that know the format, besides mutations of bytes."""
+    rearrangements: tuple[Rearrange, ...] = ()
+    """Changes to the sample's folder that are more than other bytes of one file."""
 
 
 def pixels(*shape: int) -> np.ndarray:

@@ -20,8 +20,11 @@ import pytest
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.types import InputError
 from tests.fuzz.mutations import BYTES
+from tests.fuzz.outside import was_opened
 
-MODULES = ("media", "data", "recordings", "run", "serving", "convert", "expanding")
+MODULES = (
+    "media", "data", "recordings", "run", "serving", "convert", "expanding", "robots", "sessions",
+)  # fmt: skip
 TARGETS = [t for name in MODULES for t in import_module(f"tests.fuzz.targets_{name}").TARGETS]
 CASES = int(os.environ.get("FUZZ_CASES", "10"))
 MAX_SECONDS, MAX_BYTES, MAX_MESSAGE = 20, 1 << 30, 4000
@@ -47,10 +50,15 @@ def stop_after(limit_s):
 
 
 def change(target, sample, folder, case):
-    """Change one file of a copy; return the kind of change."""
+    """Change one file of a copy, or its folder; return the kind of change."""
+    moves, kinds = target.rearrangements * 2, BYTES + target.mutations * 2
+    if moves and case.random() < len(moves) / (len(moves) + len(kinds)):
+        rearrange = case.choice(moves)
+        rearrange(folder, case)
+        return rearrange.__name__
     files = sorted({f for glob in target.files for f in sample.glob(glob) if f.is_file()})
     file = folder / case.choice(files).relative_to(sample)
-    mutate = case.choice(BYTES + target.mutations * 2)
+    mutate = case.choice(kinds)
     changed = mutate(file.read_bytes(), case)
     file.write_bytes(case.choice(BYTES)(changed, case) if case.random() < 0.1 else changed)
     return mutate.__name__
@@ -98,6 +106,7 @@ def test_a_damaged_file_is_refused_or_read_as_it_was(target, tmp_path):
             shutil.copytree(sample, folder)
             kind = change(target, sample, folder, case)
             Path("/proc/self/clear_refs").write_text("5", "ascii")
+            was_opened()
             started, had = time.thread_time(), peak_bytes()
             signal.signal(signal.SIGPROF, stop_after(started + MAX_SECONDS))
             signal.setitimer(signal.ITIMER_PROF, MAX_SECONDS)
@@ -107,6 +116,8 @@ def test_a_damaged_file_is_refused_or_read_as_it_was(target, tmp_path):
                 problem = "slow"
             if peak_bytes() - had > MAX_BYTES:
                 problem = f"{peak_bytes() - had:,} bytes of memory"
+            if was_opened():
+                problem = f"a file outside was opened; {problem}"
             if problem:
                 failures.append(f"case {number}, {kind}: {problem}")
             shutil.rmtree(folder.parent)

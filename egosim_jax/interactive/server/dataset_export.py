@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,26 @@ from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.interactive.env.backends import GeneratedWorld
 from egosim_jax.interactive.env.chunks import view_of
-from egosim_jax.interactive.server.session import CLOSED, DAMAGE, SETTINGS, Session, settings_of
-from egosim_jax.io.bounded import quote_path
+from egosim_jax.interactive.server.session import (
+    CLOSED,
+    DAMAGE,
+    SETTINGS,
+    Result,
+    Session,
+    settings_of,
+)
+from egosim_jax.io.bounded import only_inside, quote, quote_path
+from egosim_jax.io.digest import fingerprint
+from egosim_jax.io.journal import Journal
 from egosim_jax.rendering import get
 from egosim_jax.rendering.rerun_log import Recording
 from egosim_jax.simulation import preview
+from egosim_jax.state import snapshot
 from egosim_jax.state.planes import vertical
 from egosim_jax.types import Action, InputError, SceneState, Triplet, VideoGrid, VideoSpec, View
+
+MAX_POINT_PX, MAX_SIZE = 64, 8192
+"""Maximum side of a point in pixels, and number of frames, rows, columns and frames per second."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,8 +63,9 @@ def open_sessions(folder: Path, names: Sequence[str] = ()) -> tuple[list[Session
     readable, damaged = [], {}
     for path in [by_name[name] for name in dict.fromkeys(names)] or paths:
         try:
-            session = Session(path, _recorded(path))
-            session.check()
+            with only_inside([path]):
+                session = Session(path, _recorded(path))
+                _check(session)
         except DAMAGE as error:
             if names:
                 raise InputError(
@@ -73,9 +87,54 @@ def _recorded(path: Path) -> GeneratedWorld:
     """Return a world that renders a recorded session, and does not generate."""
     settings = settings_of(path)
     fields = settings["video"]
-    video = VideoSpec(**{name: fields[name] for name in ("frames", "height", "width", "fps")})
-    generator = _Unavailable(renderer=get("jax"), point_px=int(settings["point_px"]))
+    video = VideoSpec(
+        frames=_size(fields, "frames"),
+        height=_size(fields, "height"),
+        width=_size(fields, "width"),
+        fps=_size(fields, "fps"),
+    )
+    point_px = _size(settings, "point_px", limit=MAX_POINT_PX)
+    generator = _Unavailable(renderer=get("jax"), point_px=point_px)
     return GeneratedWorld(generator=generator, video=video, perception=None)
+
+
+def _size(fields: Mapping[str, Any], name: str, *, limit: int = MAX_SIZE) -> int:
+    """Return a size of a session's settings. Raises `InputError` if it is out of bounds."""
+    value = fields.get(name)
+    if type(value) is not int or not 1 <= value <= limit:
+        raise InputError(
+            f"{name} in its settings is {quote(value)}: it must be a whole number from 1 to "
+            f"{limit}. Restore the settings."
+        )
+    return value
+
+
+def _check(session: Session) -> None:
+    """Read all files that an export needs, and compare them. Raises an error of `DAMAGE`."""
+    for start, steps in session.runs():
+        session.backend.simulator(start)
+        state, image = start.state, start.first_frame
+        for seed, number in enumerate(steps, start.seed + start.steps):
+            made_of = {
+                "state": snapshot.fingerprint(state),
+                "first_frame": fingerprint(image),
+                "seed": str(seed),
+            }
+            state, image = _check_step(session, number, made_of).state, None
+
+
+def _check_step(session: Session, number: int, made_of: Mapping[str, str]) -> Result:
+    """Return the result of a step, which must be made of these inputs and of its action."""
+    video, made = session.backend.video, session.folder / "steps" / str(number) / "rollout"
+    session.actions.check(session.rows(number), max_rows=video.frames)
+    journal = Journal(made)
+    journal.verify("1 generate", made / "clip_1" / "frames.npz")
+    journal.check_inputs("run", made_of)
+    journal.check_inputs("1 action", {"action": fingerprint(session.action(number))})
+    shape, result = (video.frames, video.height, video.width, 3), session.load_result(number)
+    if result.frames.shape != shape:
+        raise InputError(f"the frames of step {number} are {result.frames.shape}, not {shape}.")
+    return result
 
 
 def to_lerobot(sessions: Sequence[Session], folder: Path) -> None:

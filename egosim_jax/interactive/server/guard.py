@@ -246,6 +246,8 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
 
     def send_receive_event_to_app(self) -> None:
         """Hand a complete message to the application; the next one has its own time."""
+        if self.curr_msg_data_type == "text":  # uvicorn logs a traceback if it is not UTF-8
+            self.frames = [b"".join(self.frames).decode("utf-8", "ignore").encode()]
         self._taken = sum(map(len, self.frames))
         self._stop()
         super().send_receive_event_to_app()

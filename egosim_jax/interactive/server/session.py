@@ -27,7 +27,7 @@ from typing import Any, no_type_check
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from egosim_jax.interactive.env.action_spec import ActionSpec
+from egosim_jax.interactive.env.action_spec import ActionSpec, to_numbers
 from egosim_jax.interactive.env.backends import Backend, preview_info
 from egosim_jax.interactive.env.batching import announced
 from egosim_jax.interactive.env.chunks import Chunk, last_camera, make_chunk, state_info, view_of
@@ -36,12 +36,11 @@ from egosim_jax.interactive.server import wire
 from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.interactive.server.requests import request_hash
 from egosim_jax.io.atomic import atomic_folder
-from egosim_jax.io.bounded import quote, quote_path, read_json
+from egosim_jax.io.bounded import check_inside, only_inside, quote, quote_path, read_json
 from egosim_jax.io.digest import fingerprint
-from egosim_jax.io.journal import Journal
 from egosim_jax.io.run import plain, write_json
 from egosim_jax.simulation.rollout import RecordedClip, Rollout, load_clip
-from egosim_jax.simulation.start import Start
+from egosim_jax.simulation.start import Start, check_size
 from egosim_jax.simulation.streams import Latency, Show
 from egosim_jax.state import snapshot
 from egosim_jax.types import Action, Cameras, InputError, SceneState
@@ -49,7 +48,7 @@ from egosim_jax.types import Action, Cameras, InputError, SceneState
 SETTINGS, CLOSED = "session.json", "closed.json"
 INFO, REQUEST = "info.json", "request.json"
 FIRST, SEAL = "first", "sha256"
-DAMAGE = (InputError, OSError, ValueError, KeyError, TypeError, IndexError)
+DAMAGE = (InputError, OSError, ValueError, KeyError, TypeError, IndexError, OverflowError)
 """Errors that reading a damaged session can raise."""
 
 
@@ -84,6 +83,8 @@ class Session:
         self.folder, self.backend = folder, backend
         self.id = folder.name
         self.actions = ActionSpec.from_json(settings_of(folder)["actions"])
+        for name in ("starts", "steps", "saved"):
+            check_inside(folder / name)  # before its files are listed
         self.running: tuple[tuple[int, str] | None, Future[Any]] | None = None
         """Last request that changes the session: number and hash of its step, and its result."""
         steps = [int(p.name) for p in (folder / "steps").glob("[0-9]*")]
@@ -136,6 +137,13 @@ class Session:
     def _start(self, number: int | str) -> Path:
         return self.folder / "starts" / str(number)
 
+    def _load_start(self, folder: Path) -> Start:
+        """Read a start. Raises `InputError` if it is damaged, or of another frame size."""
+        with only_inside([self.folder]):
+            start = Start.load(folder)
+        check_size(start, self.backend.video)
+        return start
+
     def _starts(self) -> list[int]:
         """Return the committed steps after which the session began from a new start."""
         return sorted(int(p.name) for p in (self.folder / "starts").iterdir() if p.name.isdigit())
@@ -143,10 +151,10 @@ class Session:
     def _restore(self) -> tuple[Start, Result]:
         """Read the current start and the last result from the folder."""
         if (chosen := self._start(self.committed)).exists():
-            now = Start.load(chosen)
+            now = self._load_start(chosen)
             return now, self._reset_result(now)
         base = self._starts()[-1]
-        self.now = start = Start.load(self._start(base))  # it has the camera of the actions
+        self.now = start = self._load_start(self._start(base))  # it has the camera of the actions
         past: tuple[Action, ...] = ()
         if self.backend.needs_past:
             past = tuple(self.action(n) for n in range(base + 1, self.committed + 1))
@@ -188,7 +196,7 @@ class Session:
     def action(self, number: int) -> Action:
         """Return the action of an accepted step, which follows from its rows."""
         latest = number > self._starts()[-1]
-        camera = self.now.camera if latest else Start.load(self._base(number)).camera
+        camera = self.now.camera if latest else self._load_start(self._base(number)).camera
         prompt = self._request(number)["prompt"]
         return self.actions.to_action(self.rows(number), camera=camera, prompt=prompt)[0]
 
@@ -200,14 +208,19 @@ class Session:
         """Return the request of a step. Raises `InputError` if it is damaged."""
         path = self._step(number) / REQUEST
         request = _read_sealed(path)
-        if not request.keys() >= {"prompt", "request", "rows"}:
+        prompted = isinstance(request.get("prompt"), str)
+        if not prompted or not request.keys() >= {"request", "rows"}:
             raise InputError(f"{quote_path(path)} does not describe a step's request. Restore it.")
         return request
 
     def load_result(self, number: int) -> Result:
         """Read the result of a committed step."""
-        folder, action = self._step(number), self.action(number)
-        request, clip = self._request(number), folder / "rollout" / "clip_1"
+        with only_inside([self.folder]):
+            return self._load_result(number, self.action(number))
+
+    def _load_result(self, number: int, action: Action) -> Result:
+        folder = self._step(number)
+        clip = folder / "rollout" / "clip_1"
         info = read_json(folder / INFO)
         if not isinstance(info, dict):
             raise InputError(f"{quote_path(folder / INFO)} does not describe a step. Restore it.")
@@ -217,7 +230,7 @@ class Session:
             frames=load_clip(clip / "frames.npz", self.backend.video.fps).frames,
             # without perception, no step writes a state: the start's one stays
             state=snapshot.load(state if state.exists() else self._base(number) / "state"),
-            row=np.array(request["rows"][-1], float),
+            row=self.rows(number)[-1],
             camera=last_camera(action),
             info=info,
         )
@@ -359,7 +372,7 @@ class Session:
     def first_start(self) -> Start:
         """Return the start with which the session was created."""
         first = self._start(FIRST)
-        return Start.load(first if first.exists() else self._start(0))
+        return self._load_start(first if first.exists() else self._start(0))
 
     @property
     def saved(self) -> list[str]:
@@ -380,31 +393,18 @@ class Session:
                 f"The session has saved nothing as {quote(name)}; it has {self.saved[:20]}. Save "
                 "it first.",
             )
-        return self.restart(Start.load(folder))
+        return self.restart(self._load_start(folder))
 
     def runs(self) -> Iterator[tuple[Start, list[int]]]:
         """Yield each run of steps between resets and loads: its start and committed steps."""
         starts = self._starts()
         for base, end in zip(starts, [*starts[1:], self.committed], strict=True):
             if base < end:
-                yield Start.load(self._start(base)), list(range(base + 1, end + 1))
-
-    def check(self) -> None:
-        """Read all files that an export needs, and compare them. Raises an error of `DAMAGE`."""
-        video = self.backend.video
-        shape = (video.frames, video.height, video.width, 3)
-        for start, steps in self.runs():
-            self.backend.simulator(start)
-            for number in steps:
-                made = self._step(number) / "rollout"
-                Journal(made).verify("1 generate", made / "clip_1" / "frames.npz")
-                self.actions.check(self.rows(number), max_rows=video.frames)
-                if (found := self.load_result(number).frames.shape) != shape:
-                    raise InputError(f"the frames of step {number} are {found}, not {shape}.")
+                yield self._load_start(self._start(base)), list(range(base + 1, end + 1))
 
     def rows(self, number: int) -> Float[np.ndarray, "f d"]:
         """Return the row of each frame of a committed step."""
-        return np.array(self._request(number)["rows"], float)
+        return to_numbers(self._request(number)["rows"])
 
 
 def settings_of(folder: Path) -> dict[str, Any]:

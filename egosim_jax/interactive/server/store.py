@@ -40,7 +40,7 @@ from egosim_jax.interactive.server.session import (
     check_world,
 )
 from egosim_jax.io.atomic import atomic_write, lock_folder
-from egosim_jax.io.bounded import quote, quote_path
+from egosim_jax.io.bounded import only_inside, quote, quote_path
 from egosim_jax.runtime.terminal import printable
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.simulation.start import Start, check_size
@@ -82,10 +82,11 @@ class Store:
             shutil.rmtree(path, ignore_errors=True)
         for path in sorted(self.folder.glob(f"[!.]*/{SETTINGS}")):
             try:
-                check_world(path.parent, self.backend)
-                session = Session(path.parent, self.backend)
-                number = session.committed + 1
-                key = (number, session.hash_of(number)) if session.pending else None
+                with only_inside([path.parent]):
+                    check_world(path.parent, self.backend)
+                    session = Session(path.parent, self.backend)
+                    number = session.committed + 1
+                    key = (number, session.hash_of(number)) if session.pending else None
             except DAMAGE as error:
                 self.damaged[path.parent.name] = str(self._for_client(error))
                 problem = f"cannot resume session {path.parent.name}: {error}"

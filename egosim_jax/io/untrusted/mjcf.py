@@ -12,7 +12,14 @@ from pathlib import Path
 from typing import Any, NoReturn
 from xml.parsers import expat
 
-from egosim_jax.io.bounded import open_regular, quote, quote_path, read_bytes, refusing
+from egosim_jax.io.bounded import (
+    open_regular,
+    quote,
+    quote_path,
+    read_bytes,
+    real_path,
+    refusing,
+)
 from egosim_jax.types import InputError
 
 MAX_FILES = 10_000
@@ -25,14 +32,14 @@ OUTSIDE = re.compile(r"[/\\]|[A-Za-z]:|(.*[/\\])?\.\.([/\\]|$)", re.DOTALL)
 
 def check_files(folder: Path) -> None:
     """Raise `InputError` unless a model can only read regular files of its folder."""
-    root = folder.resolve()
+    root = real_path(folder)
     for number, path in enumerate(sorted(root.rglob("*"))):
         if number == MAX_FILES:
             raise InputError(
                 f"{quote_path(folder)} has more than {MAX_FILES:,} files, the maximum of a robot's "
                 "model. Give the folder of one model."
             )
-        if not path.resolve().is_relative_to(root):
+        if not real_path(path).is_relative_to(root):
             raise InputError(
                 f"{quote_path(path)} is a link out of its folder, which is not followed: put a "
                 "copy of the file in its place."

@@ -109,13 +109,16 @@ def test_links_out_of_the_source_are_refused_and_those_of_a_hub_cache_followed(t
         folder.mkdir(parents=True)
     (blobs / "5e").write_text("blob")
     (source / "own").write_text("own")
-    for name, target in {"blob": blobs / "5e", "out": tmp_path / "secret", "in": "own"}.items():
+    targets = {"blob": blobs / "5e", "out": tmp_path / "secret", "in": "own", "loop": "loop"}
+    for name, target in targets.items():
         (source / name).symlink_to(target)
     with only_inside([source]):
         for name, text in (("own", b"own"), ("in", b"own"), ("blob", b"blob")):
             assert read_bytes(source / name, limit=9) == text
         with pytest.raises(InputError, match="is a link to a file outside"):
             read_bytes(source / "out", limit=9)
+        with pytest.raises(InputError, match="cannot be read"):
+            read_bytes(source / "loop", limit=9)
     assert read_bytes(source / "out", limit=9) == b"mine"
 
 

@@ -33,6 +33,10 @@ def asset(text):
     return XML.replace("<worldbody>", f"<asset>{text}</asset><worldbody>")
 
 
+def child(text):
+    return XML.replace("<worldbody>", f"<worldbody>{text}")
+
+
 def test_a_model_of_a_folder_is_the_compiled_one(folder):
     write(folder, XML)
     (folder / "assets" / "a.txt").write_text("")
@@ -51,6 +55,12 @@ def test_a_model_of_a_folder_is_the_compiled_one(folder):
         (XML.replace('"palm"', '"other"'), "body 'palm'"),
         (XML.replace('"elbow"', '"other"'), "joint 'elbow'"),
         (XML.replace('<joint joint1="drive" joint2="follow"/>', "").replace("drive", "d"), "drive"),
+        (XML.replace('name="roll"', 'name="roll" type="ball"'), "'roll'"),
+        (child('<body><freejoint name="f"/><geom size="1 1"/></body>'), "'f'"),
+        (
+            child('<replicate count="501" offset="1 0 0"><geom size="1 1"/></replicate>'),
+            "geometries",
+        ),
         (asset('<mesh name="m" file="gone.stl"/>'), "gone.stl"),
         (XML[:-40], "panda.xml"),
         ("", "panda.xml"),
@@ -72,15 +82,17 @@ def test_a_broken_or_hostile_model_is_refused_with_a_name(folder, text, said):
     assert str(caught.value).isprintable()
 
 
-@pytest.mark.parametrize("kind", ["pipe", "link", "folder"])
+@pytest.mark.parametrize("kind", ["pipe", "link", "folder", "loop"])
 def test_files_that_are_not_the_folders_own_are_refused(folder, kind):
     write(folder, asset('<mesh name="m" file="assets/m.stl"/>'))
     if kind == "pipe":
         os.mkfifo(folder / "assets" / "m.stl")
+    elif kind == "loop":
+        (folder / "assets" / "m.stl").symlink_to("m.stl")
     else:
         place = folder / "assets" / ("m.stl" if kind == "link" else "more")
         place.symlink_to("/etc/hostname" if kind == "link" else "/etc")
-    with pytest.raises(InputError, match=r"regular file|link out"):
+    with pytest.raises(InputError, match=r"regular file|link out|symbolic links"):
         load_model(ARM)
 
 

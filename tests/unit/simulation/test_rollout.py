@@ -1,5 +1,6 @@
 """The journaled loop around a small generator, in a world with ground truth."""
 
+import json
 import os
 import shutil
 import signal
@@ -12,7 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from egosim_jax.io.journal import Journal
+from egosim_jax.io.journal import Journal, _chained
 from egosim_jax.perception.oracle import OracleConfig
 from egosim_jax.rendering.reference import draw_hands
 from egosim_jax.runtime.phases import show_phases
@@ -224,6 +225,14 @@ def test_a_line_without_its_hash_is_refused_with_the_way_out(tmp_path):
     (tmp_path / "journal.jsonl").write_text(line)
     with pytest.raises(InputError, match=r"line 1 was changed or is missing.* to start over"):
         run(tmp_path)
+
+
+@pytest.mark.parametrize("entry", [{}, {"phase": [1]}, {"phase": "run", "made_of": 3}])
+def test_a_line_that_is_no_phase_is_refused_even_if_its_hash_is_right(tmp_path, entry):
+    line = json.dumps({**entry, "chain": _chained("", entry)}) + "\n"
+    (tmp_path / "journal.jsonl").write_text(line)
+    with pytest.raises(InputError, match="line 1 was changed or is missing"):
+        Journal(tmp_path)
 
 
 def test_any_changed_byte_of_the_journal_is_noticed(finished):

@@ -44,6 +44,13 @@ def test_the_limit_itself_is_accepted_and_the_server_goes_on(server):
         assert wire.unpack(socket_.recv(timeout=30))["damaged"] == []
 
 
+def test_text_that_is_not_utf_8_is_answered_like_other_text(server):
+    with connect(f"ws://127.0.0.1:{server[1]}", compression=None) as socket_:
+        socket_.recv(timeout=30)
+        socket_.send(b"\xff\xfe", text=True)
+        assert "must be binary" in json.loads(socket_.recv(timeout=30))["message"]
+
+
 @pytest.mark.parametrize(
     "name", ["connections", "cycle.response_complete", "limit_concurrency", "loop", "transport"]
 )

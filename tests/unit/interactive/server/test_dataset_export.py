@@ -135,6 +135,10 @@ def replace_frames(path):
         ("closed.json", lambda v: v["actions"].update(sides=["left"])),
         ("steps/2/rollout/clip_1/frames.npz", None),
         ("steps/2/info.json", None),
+        ("starts/0/start.json", lambda v: v["world_from_camera"][0].__setitem__(3, 0.1)),
+        ("starts/0/start.json", lambda v: v.update(seed=5)),
+        ("starts/0/start.json", lambda v: v.update(height=10**9)),
+        ("starts/0/first_frame.png", None),
     ],
 )
 def test_an_edited_session_is_skipped(folder, tmp_path, file, change):
@@ -145,6 +149,8 @@ def test_an_edited_session_is_skipped(folder, tmp_path, file, change):
         edit(copy / "bad" / file, change)
     elif file.endswith(".npz"):
         replace_frames(copy / "bad" / file)
+    elif file.endswith(".png"):
+        Image.new("RGB", (VIDEO.width, VIDEO.height)).save(copy / "bad" / file)
     else:
         (copy / "bad" / file).write_text("[]")
     readable, damaged = dataset_export.open_sessions(copy)
@@ -161,3 +167,41 @@ def test_rows_out_of_bounds_are_skipped_even_if_their_hash_is_right(folder, tmp_
     session._write_sealed(path, fields)
     with pytest.raises(InputError, match="cannot be exported: Row 2"):
         dataset_export.open_sessions(tmp_path / "sessions", ["one"])
+
+
+@pytest.mark.parametrize(
+    ("file", "change"),
+    [
+        ("closed.json", lambda v: v.update(point_px=10**6)),
+        ("closed.json", lambda v: v.update(point_px=2.5)),
+        ("closed.json", lambda v: v["video"].update(fps=float("nan"))),
+        ("closed.json", lambda v: v["video"].update(width=10**9)),
+        ("steps/2/request.json", lambda v: v["rows"][2].__setitem__(0, v["rows"][2][0] + 0.01)),
+        ("steps/2/request.json", lambda v: v["rows"][2].__setitem__(0, 10**400)),
+        ("steps/2/request.json", lambda v: v.update(prompt=["x"])),
+        ("steps/2/request.json", lambda v: v.update(prompt="Another prompt.")),
+    ],
+)
+def test_an_edited_session_is_skipped_even_if_its_hash_is_right(folder, tmp_path, file, change):
+    shutil.copytree(folder, tmp_path / "sessions")
+    path = tmp_path / "sessions" / "one" / file
+    fields = json.loads(path.read_text())
+    del fields[session.SEAL]
+    change(fields)
+    session._write_sealed(path, fields)
+    with pytest.raises(InputError, match="Session one cannot be exported"):
+        dataset_export.open_sessions(tmp_path / "sessions", ["one"])
+
+
+@pytest.mark.parametrize("file", ["starts", "starts/0/first_frame.png", "steps/2/info.json"])
+def test_links_out_of_a_session_are_not_followed(folder, tmp_path, file):
+    copy = tmp_path / "sessions" / "one"
+    shutil.copytree(folder / "one", copy)
+    (copy / file).rename(tmp_path / "secret")
+    (copy / file).symlink_to(tmp_path / "secret")
+    with pytest.raises(InputError, match="is a link to a file outside"):
+        dataset_export.open_sessions(copy.parent, ["one"])
+    shutil.copytree(folder / "one", tmp_path / "elsewhere" / "one")
+    shutil.rmtree(copy)
+    copy.symlink_to(tmp_path / "elsewhere" / "one")
+    assert [s.id for s in dataset_export.open_sessions(copy.parent)[0]] == ["one"]

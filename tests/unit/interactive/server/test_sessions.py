@@ -1,5 +1,6 @@
 """Sessions of a painted world: journal, resumption, limits, isolation."""
 
+import json
 import shutil
 from dataclasses import replace
 
@@ -182,14 +183,33 @@ def test_a_damaged_session_does_not_disturb_the_others(store, tmp_path):
     again.close()
 
 
-def test_a_damaged_save_is_refused_without_the_paths_of_the_server(store):
+@pytest.mark.parametrize(
+    "fields", [None, {"row": [1, [2]]}, {"past": [3]}, {"height": 10**9}, {"row": [10**400]}]
+)
+def test_a_damaged_save_is_refused_without_the_paths_of_the_server(store, fields):
     made = store.create({"seed": 3})
     store.save({"session": made.id, "name": "a"}).result()
-    (made.folder / "saved" / "a" / "start.json").write_text("{")
-    with pytest.raises(RequestError, match=r"start\.json") as refused:
+    start = made.folder / "saved" / "a" / "start.json"
+    old = start.read_text()
+    start.write_text("{" if fields is None else json.dumps({**json.loads(old), **fields}))
+    with pytest.raises(RequestError, match=r"start|frames of") as refused:
         store.load({"session": made.id, "name": "a"}).result()
     assert (refused.value.status, str(store.folder) in str(refused.value)) == (422, False)
     assert step(store, made, 1).step_id == 1
+
+
+@pytest.mark.parametrize("file", ["saved/a/first_frame.png", "starts", "steps/1/info.json"])
+def test_links_out_of_a_session_are_not_followed(store, tmp_path, file):
+    made = store.create({"session": "one"})
+    store.save({"session": "one", "name": "a"}).result()
+    step(store, made, 1)
+    store.close()
+    (made.folder / file).rename(tmp_path / "secret")
+    (made.folder / file).symlink_to(tmp_path / "secret")
+    again = Store(store.folder, painted(), Limits())
+    with pytest.raises(RequestError, match="is a link to a file outside"):
+        again.load({"session": "one", "name": "a"}).result()
+    again.close()
 
 
 def test_a_store_that_closes_at_once_gives_up_what_waits(tmp_path, monkeypatch):
