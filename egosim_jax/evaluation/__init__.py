@@ -12,7 +12,7 @@ here.
     estimated    columns that need estimates: regions, depth, cameras, hands
     fvd          Fréchet video distance
     scoring      Protocol, Scoring: score methods on clips
-    registration, crops, cache   crops that images show; scores by content
+    registration, cache   crops that images show; scores by content
     result       Evaluation: summaries, paired differences, report
     tables       the papers' tables
     files        report.json, metrics.jsonl, scores.csv, table.tex, scores.png

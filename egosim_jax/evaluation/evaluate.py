@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from egosim_jax.data.clip_files import ClipFiles
 from egosim_jax.evaluation.cache import CACHE, ScoreCache
@@ -15,22 +15,15 @@ from egosim_jax.evaluation.result import Evaluation
 from egosim_jax.evaluation.scoring import Protocol, Scoring
 
 
-def evaluate(
-    generated: Path,
-    clips: Sequence[ClipFiles],
-    *,
-    size: Literal["output", "target"] = "output",
-    out: Path | None = None,
-) -> Evaluation:
+def evaluate(generated: Path, clips: Sequence[ClipFiles]) -> Evaluation:
     """Compare the clips in a folder, and the baselines, with their ground truth.
 
-    {id}_vae.mp4 (the ground truth through the autoencoder) is compared, too, if it exists. `out` is
-    by default the folder of the clips. Clips that cannot be compared are skipped. Raises
-    `InputError` if no clip can be compared.
+    {id}_vae.mp4 (the ground truth through the autoencoder) is compared, too, if it exists. Clips
+    that cannot be compared are skipped. Raises `InputError` if no clip can be compared.
     """
     folder = Folder(path=generated, name="generated", title="generated")
     methods = [folder, *BASELINES.values(), autoencoded(generated)]
-    return compare(methods, clips, standard(), protocol=Protocol(size=size), out=out or generated)
+    return compare(methods, clips, standard(), protocol=Protocol(), out=generated)
 
 
 def compare(

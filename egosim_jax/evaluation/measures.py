@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import UInt8
 
 from egosim_jax.data.windows import Window
+from egosim_jax.evaluation.methods import WHOLE, Edges
 from egosim_jax.evaluation.metrics import lpips
 from egosim_jax.evaluation.metrics.dreamsim import DEFINITION, DreamSim
 from egosim_jax.evaluation.metrics.image import clip_psnr, color_drift, psnr, ssim
 from egosim_jax.evaluation.metrics.report import DEFINITIONS
-from egosim_jax.evaluation.registration import WHOLE, Edges
 from egosim_jax.runtime.registry import Registry
 
 VERSION = 1

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
@@ -21,7 +21,6 @@ from egosim_jax.data.clip_files import is_safe_id
 from egosim_jax.data.transforms import resize_image
 from egosim_jax.data.windows import Window
 from egosim_jax.evaluation.metrics.image import fit_colors
-from egosim_jax.evaluation.registration import WHOLE, Edges
 from egosim_jax.io.bounded import quote_path, quote_text
 from egosim_jax.io.video import read_video
 from egosim_jax.types import InputError
@@ -33,6 +32,39 @@ FIT = (
     "of the comparison; a video that exceeds the size of the whole by at most "
     f"{MAX_BORDER_PX} rows and columns has a border, and is cropped to its center"
 )
+
+
+class Edges(NamedTuple):
+    """Edges of a part of an image, in shares of its width and height."""
+
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+    def common(self, other: Edges) -> Edges:
+        """Return the intersection; it may be empty."""
+        return Edges(*map(max, self[:2], other[:2]), *map(min, self[2:], other[2:]))
+
+    def pixels(self, height: int, width: int) -> Edges:
+        """Return the edges in pixels of an image."""
+        return Edges(*np.multiply(self, (width, height) * 2).tolist())
+
+    def whole_pixels(self, height: int, width: int) -> Edges:
+        """Return the largest crop inside that has whole pixels of an image."""
+        edges = np.round(self.pixels(height, width), 2)
+        inside = np.concatenate([np.ceil(edges[:2]), np.floor(edges[2:])])
+        return Edges(*(inside / ((width, height) * 2)).tolist())
+
+    def within(self, other: Edges) -> Edges:
+        """Return this crop in shares of the crop `other`."""
+        left, top, right, bottom = other
+        size = np.array([right - left, bottom - top] * 2)
+        return Edges(*((np.array(self) - [left, top, left, top]) / size).tolist())
+
+
+WHOLE = Edges(0.0, 0.0, 1.0, 1.0)
+"""The whole image."""
 
 
 class Shape(NamedTuple):
@@ -49,31 +81,6 @@ class Shape(NamedTuple):
         """Height and width of the whole image at the scale of the comparison."""
         left, top, right, bottom = self.crop
         return round(self.height / (bottom - top)), round(self.width / (right - left))
-
-
-@runtime_checkable
-class Method(Protocol):
-    """A row of a table."""
-
-    @property
-    def name(self) -> str:
-        """Key of the method in reports."""
-        ...
-
-    @property
-    def title(self) -> str:
-        """Name of the method in tables."""
-        ...
-
-    def sources(self, window: Window) -> tuple[Path, ...]:
-        """Return the files, other than the ground truth, on which the video depends."""
-        ...
-
-    def video(
-        self, window: Window, shape: Shape, target: UInt8[np.ndarray, "f h w 3"]
-    ) -> UInt8[np.ndarray, "f h w 3"]:
-        """Return the video of a window. Raises `InputError` if it is missing."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,48 +161,28 @@ class Folder:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Prior:
-    """The copied prior, optionally with an affine color map fitted to the ground truth."""
+class Baseline:
+    """A video without a model, from the prior or the ground truth."""
 
-    fitted: bool = False
-    """True to fit the colors."""
-
-    @property
-    def name(self) -> str:
-        """Key of the baseline in reports."""
-        return "prior_fit" if self.fitted else "prior"
-
-    @property
-    def title(self) -> str:
-        """Name of the baseline in tables."""
-        return "prior, colors fitted to the ground truth" if self.fitted else "prior"
-
-    def sources(self, window: Window) -> tuple[Path, ...]:
-        """Return the prior's file."""
-        return (window.files.prior,)
-
-    def video(self, window: Window, shape: Shape, target: np.ndarray) -> np.ndarray:
-        """Return the prior over the window's frames."""
-        prior = read_at(window.files.prior, shape, window.start)
-        return fit_colors(prior, target) if self.fitted else prior
-
-
-@dataclass(frozen=True, kw_only=True)
-class Still:
-    """First frame of the ground truth, repeated."""
-
-    name: str = "still"
+    name: Literal["prior", "prior_fit", "still"]
     """Key of the baseline in reports."""
-    title: str = "first frame of the ground truth, repeated"
+    title: str
     """Name of the baseline in tables."""
 
     def sources(self, window: Window) -> tuple[Path, ...]:
-        """Return no files: the video depends only on the ground truth."""
-        return ()
+        """Return the files, other than the ground truth, on which the video depends."""
+        return () if self.name == "still" else (window.files.prior,)
 
     def video(self, window: Window, shape: Shape, target: np.ndarray) -> np.ndarray:
-        """Return the first frame at all frames."""
-        return np.broadcast_to(target[:1], target.shape)
+        """Return the first frame at all frames, or the prior over the window's frames."""
+        if self.name == "still":
+            return np.broadcast_to(target[:1], target.shape)
+        prior = read_at(window.files.prior, shape, window.start)
+        return fit_colors(prior, target) if self.name == "prior_fit" else prior
+
+
+Method = Folder | Baseline
+"""A row of a table."""
 
 
 def autoencoded(path: Path) -> Folder:
@@ -204,10 +191,10 @@ def autoencoded(path: Path) -> Folder:
     return Folder(path=path, name="vae", title=title, suffix="_vae", optional=True)
 
 
-BASELINES: dict[str, Method] = {
-    "prior": Prior(),
-    "prior_fit": Prior(fitted=True),
-    "still": Still(),
+BASELINES: dict[str, Baseline] = {
+    "prior": Baseline(name="prior", title="prior"),
+    "prior_fit": Baseline(name="prior_fit", title="prior, colors fitted to the ground truth"),
+    "still": Baseline(name="still", title="first frame of the ground truth, repeated"),
 }
 """Baselines without a model, by name."""
 

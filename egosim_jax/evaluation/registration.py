@@ -13,11 +13,20 @@ contrast of unknown size in each clip. A clip that the method got wrong thus has
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
+
+from egosim_jax.data.windows import Window
+from egosim_jax.evaluation.cache import ScoreCache
+from egosim_jax.evaluation.measures import VERSION
+from egosim_jax.evaluation.methods import WHOLE, Edges, Folder, without_border
+from egosim_jax.io.digest import fingerprint, sha256
+from egosim_jax.io.video import VideoInfo, probe_video, read_video
 
 MIN_CORRELATION = 0.7
 """Minimum median correlation over clips of a crop that counts as found."""
@@ -29,43 +38,12 @@ MIN_GAIN = 0.1
 """Minimum mean gain over clips of -log(1 - r^2) for a crop to replace the whole image."""
 FRAMES, TRUE_FRAMES = 6, 24
 """Number of a method's frames, and of recorded frames, that are used of each clip."""
+CLIPS, MAX_FRAMES = 8, 64
+"""Maximum number of clips from which a crop is found, and of the frames read of each."""
 _COARSE_PX, _FINE_PX, _EVERY = 96, 320, 4
 """Widths of the images in both searches, and the step of frames in the first."""
 _MIN_SHARE = 0.3
 """Minimum width of a crop in the search, as a share of the recorded width."""
-
-
-class Edges(NamedTuple):
-    """Edges of a part of an image, in shares of its width and height."""
-
-    left: float
-    top: float
-    right: float
-    bottom: float
-
-    def common(self, other: Edges) -> Edges:
-        """Return the intersection; it may be empty."""
-        return Edges(*map(max, self[:2], other[:2]), *map(min, self[2:], other[2:]))
-
-    def pixels(self, height: int, width: int) -> Edges:
-        """Return the edges in pixels of an image."""
-        return Edges(*np.multiply(self, (width, height) * 2).tolist())
-
-    def whole_pixels(self, height: int, width: int) -> Edges:
-        """Return the largest crop inside that has whole pixels of an image."""
-        edges = np.round(self.pixels(height, width), 2)
-        inside = np.concatenate([np.ceil(edges[:2]), np.floor(edges[2:])])
-        return Edges(*(inside / ((width, height) * 2)).tolist())
-
-    def within(self, other: Edges) -> Edges:
-        """Return this crop in shares of the crop `other`."""
-        left, top, right, bottom = other
-        size = np.array([right - left, bottom - top] * 2)
-        return Edges(*((np.array(self) - [left, top, left, top]) / size).tolist())
-
-
-WHOLE = Edges(0.0, 0.0, 1.0, 1.0)
-"""The whole image."""
 
 
 class Found(NamedTuple):
@@ -81,6 +59,74 @@ class Found(NamedTuple):
 
 Pair = tuple[UInt8[np.ndarray, "_ h w 3"], UInt8[np.ndarray, "_ i j 3"]]
 """`FRAMES` frames of a method's clip and `TRUE_FRAMES` of its ground truth, over equal times."""
+
+
+def find_crops(
+    folder: Folder, lengths: Mapping[Window, VideoInfo], *, cache: ScoreCache, every: bool
+) -> list[str]:
+    """Find the crop of each data set's clips of one size; store it in the folder.
+
+    Without `every`, images of the ground truth's size show all of it. Returns the crops in words.
+    """
+    groups: dict[tuple[str, int, int, int, int], list[tuple[Window, Path]]] = {}
+    for window, info in lengths.items():
+        path = window.files.target
+        if path is None or not path.exists():
+            continue
+        truth = probe_video(path)
+        blank = np.broadcast_to(np.uint8(0), (info.height, info.width))
+        size = without_border(blank, truth.height, truth.width).shape
+        if every or size != (truth.height, truth.width):
+            key = (window.files.extra.get("dataset", ""), *size, truth.height, truth.width)
+            groups.setdefault(key, []).append((window, path))
+    lines = []
+    for (dataset, _, _, height, width), clips in groups.items():
+        result = _find(folder, clips[:CLIPS], lengths, cache)
+        folder.crops.update({window.output_id: result.crop for window, _ in clips})
+        evidence = f"correlation {result.correlation:.3f}, {len(clips[:CLIPS])} clips"
+        if not result.found:
+            text = "no crop was found; the images are stretched to the whole"
+        elif result.crop == WHOLE:
+            text = "the whole image"
+        else:
+            edges = result.crop.pixels(height, width)
+            left, top, right, bottom = (f"{edge + 0:.1f}" for edge in np.round(edges, 1))
+            text = f"columns {left} to {right}, rows {top} to {bottom} of {width}x{height}"
+        name = f"{folder.name}, {dataset}" if dataset else folder.name
+        lines.append(f"{name}: {text} ({evidence})")
+    return lines
+
+
+def _find(
+    folder: Folder,
+    clips: Sequence[tuple[Window, Path]],
+    lengths: Mapping[Window, VideoInfo],
+    cache: ScoreCache,
+) -> Found:
+    """Return the crop of some clips, cached or computed."""
+    content = [[sha256(folder.file(w)), sha256(path), w.start] for w, path in clips]
+    key = fingerprint(["crop", VERSION, content])
+    values = cache.get(key)
+    if values is None:
+        result = find_crop(
+            [_pair(folder.file(w), path, w.start, lengths[w].frames) for w, path in clips]
+        )
+        evidence = {"correlation": result.correlation, "found": float(result.found)}
+        values = {**result.crop._asdict(), **evidence}
+        cache.put(key, values)
+    crop = Edges(*(values[name] for name in Edges._fields))
+    return Found(crop, values["correlation"], bool(values["found"]))
+
+
+def _pair(video: Path, truth: Path, start: int, count: int) -> Pair:
+    """Return frames of a method's clip and of its ground truth, over equal times."""
+    count = min(count, MAX_FRAMES)
+    true = read_video(truth, start=start, stop=start + count).frames
+    taken = np.unique(places(TRUE_FRAMES, min(count, len(true)))).tolist()
+    chosen = [taken[place] for place in np.unique(places(FRAMES, len(taken)))]
+    border = partial(without_border, height=true.shape[1], width=true.shape[2])
+    frames = read_video(video, stop=count, each=border).frames
+    return frames[chosen], true[taken]
 
 
 def find_crop(pairs: Sequence[Pair]) -> Found:
@@ -161,19 +207,14 @@ def _matched(pair: Pair, crops: Sequence[Edges]) -> _Couple:
     high = round(height * wide / width)
     trues = [_resized(_gray(frame), high, wide) for frame in true]
     scale = (wide / width, high / height)
-    best, best_couple = -1.0, None
+    couples = []
     for frame in video:
         gray = _gray(frame)
         for crop in crops:
             across, down = (crop.right - crop.left) * scale[0], (crop.bottom - crop.top) * scale[1]
             image = _resized(gray, max(round(down), 16), max(round(across), 16))
-            for other in trues:
-                couple = _Couple(image, other, scale)
-                if (value := _correlation(crop, couple)) > best:
-                    best, best_couple = value, couple
-    if best_couple is None:
-        return _Couple(_resized(_gray(video[0]), high, wide), trues[0], scale)
-    return best_couple
+            couples += [(crop, _Couple(image, other, scale)) for other in trues]
+    return max(couples, key=lambda candidate: _correlation(*candidate))[1]
 
 
 def _evidence(crop: Edges, couples: Sequence[_Couple]) -> Float[np.ndarray, " n"]:
@@ -197,16 +238,10 @@ def _correlation(crop: Edges, couple: _Couple) -> float:
     seen = cv2.warpAffine(
         true, matrix, (columns, rows), flags=flags, borderMode=cv2.BORDER_REPLICATE
     )
-    first, last = (
-        np.ceil([-left / across - 1e-6, -top / down - 1e-6]),
-        np.floor(
-            [(true.shape[1] - 1 - left) / across + 1e-6, (true.shape[0] - 1 - top) / down + 1e-6]
-        ),
-    )
-    inside = (
-        slice(max(int(first[1]), 0), max(int(last[1]) + 1, 0)),
-        slice(max(int(first[0]), 0), max(int(last[0]) + 1, 0)),
-    )
+    offset, step = np.array([left, top]), np.array([across, down])
+    first = np.ceil(-offset / step - 1e-6).clip(0).astype(int)
+    end = np.floor((np.array(true.shape[::-1]) - 1 - offset) / step + 1e-6).astype(int) + 1
+    inside = slice(first[1], max(end[1], 0)), slice(first[0], max(end[0], 0))
     a, b = image[inside], seen[inside]
     if a.size < image.size // 4:
         return 0.0

@@ -20,11 +20,10 @@ import numpy as np
 from egosim_jax.data.clip_files import ClipFiles
 from egosim_jax.data.windows import Window, read_results
 from egosim_jax.evaluation.cache import ScoreCache, Scores
-from egosim_jax.evaluation.crops import find_crops
 from egosim_jax.evaluation.fvd import is_feature
 from egosim_jax.evaluation.measures import VERSION, GroundTruth, Measure, Scorer
-from egosim_jax.evaluation.methods import FIT, Folder, Method, Shape, read_at
-from egosim_jax.evaluation.registration import WHOLE, Edges
+from egosim_jax.evaluation.methods import FIT, WHOLE, Edges, Folder, Method, Shape, read_at
+from egosim_jax.evaluation.registration import find_crops
 from egosim_jax.io.bounded import listing
 from egosim_jax.io.digest import fingerprint, sha256
 from egosim_jax.io.video import VideoInfo, probe_video

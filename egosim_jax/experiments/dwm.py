@@ -20,7 +20,7 @@ from egosim_jax.experiments.dwm_training import VARIANTS, Camera, Hands, Trainin
 from egosim_jax.experiments.report import (
     Table,
     cached_videos,
-    differences_of,
+    differences,
     over_seeds,
     show,
     summarize_runs,
@@ -103,13 +103,13 @@ def run(settings: DWM) -> None:
         definitions=REPORT_DEFINITIONS,
         titles=titles,
         tables={camera: table for camera, (table, _) in compared.items()},
-        differences={camera: differences for camera, (_, differences) in compared.items()},
+        differences={camera: gaps for camera, (_, gaps) in compared.items()},
         paper=PAPER,
     )
-    for camera, (table, differences) in compared.items():
+    for camera, (table, gaps) in compared.items():
         for title, rows in (
             ("mean ± spread over scenes (± over seeds)", table),
-            ("DWM minus the row, with its 95 % interval", differences),
+            ("DWM minus the row, with its 95 % interval", gaps),
         ):
             titled = {titles[name]: row for name, row in rows.items()}
             show(f"{camera} camera: {title}", titled, MEASURES)
@@ -191,7 +191,7 @@ def _compare(
     draw_scenes(settings.out / f"contact_sheet_{camera}.png", scenes, shown)
     by_scene = {name: over_seeds(runs, MEASURES) for name, runs in scores.items()}
     table = {name: summarize_runs(runs, MEASURES) for name, runs in scores.items()}
-    return table, differences_of(REFERENCE, by_scene, MEASURES)
+    return table, differences(by_scene, REFERENCE, MEASURES, minus="row")
 
 
 def _videos_file(out: Path, name: str) -> Path:

@@ -19,7 +19,7 @@ from egosim_jax.experiments.config import Embodiment, Hyperparameters
 from egosim_jax.experiments.report import (
     Table,
     cached_videos,
-    differences_of,
+    differences,
     plot,
     show,
     write_report,
@@ -109,15 +109,14 @@ def run(settings: Embodiment) -> None:
             table[name] = {"before": {"mean": first}, "after": {"mean": last}, **table[name]}
     report = {"definitions": REPORT_DEFINITIONS, "table": table, "validation": losses}
     compared = {name: scores[name] for name in (CONVERTED, "full", "human") if name in scores}
-    differences = {}
     if CONVERTED in trained:
-        differences = differences_of(CONVERTED, compared, MEASURES)
-    write_report(out, **report, **({"differences": differences} if differences else {}))
+        report["differences"] = differences(compared, CONVERTED, MEASURES, minus="row")
+    write_report(out, **report)
     rows = {METHODS.get(name, name): row for name, row in table.items()}
     show("robot, held out: mean ± spread over scenes", rows, {**LOSSES, **MEASURES})
-    if differences:
+    if CONVERTED in trained:
         title = "with converted clips, less: mean difference and its 95 % interval"
-        show(title, {METHODS[name]: row for name, row in differences.items()}, MEASURES)
+        show(title, {METHODS[name]: row for name, row in report["differences"].items()}, MEASURES)
     for name in trained.keys() - {"human", "scratch"}:
         first, *_, last = losses[name].values()
         verb = "lowers" if last < first else "does not lower"

@@ -19,7 +19,7 @@ from egosim_jax.evaluation.metrics import region
 from egosim_jax.evaluation.metrics.state_update import ON_SURFACE_M, distance_to_mesh
 from egosim_jax.experiments.config import LookAway
 from egosim_jax.experiments.continuous import METHODS, NOT_UPDATED, folder_name
-from egosim_jax.experiments.report import differences_from, show, summaries, write_report
+from egosim_jax.experiments.report import differences, show, summaries, write_report
 from egosim_jax.experiments.scenes import carrying
 from egosim_jax.generation.generator import Generator
 from egosim_jax.geometry import invert, transform
@@ -132,20 +132,20 @@ def run(settings: LookAway) -> None:
         for method in METHODS:
             simulated = _simulate(story, generator, method, _folder(out, case, method, seed))
             scores.setdefault(f"{case}: {method}", []).append(simulated)
-    table, differences = summaries(scores, MEASURES), {}
+    table, gaps = summaries(scores, MEASURES), {}
     for case in CASES:
         by_method = {f"{case}: {method}": scores[f"{case}: {method}"] for method in METHODS}
-        differences |= differences_from(f"{case}: {NOT_UPDATED}", by_method, MEASURES)
+        gaps |= differences(by_method, f"{case}: {NOT_UPDATED}", MEASURES)
     write_report(
         out,
         definitions=DEFINITIONS,
         seeds=seeds,
         table=table,
         scores=scores,
-        differences=differences,
+        differences=gaps,
     )
     show("after looking back: mean ± spread over scenes", table, MEASURES)
-    show("difference from no update, with its 95 % interval", differences, MEASURES)
+    show("difference from no update, with its 95 % interval", gaps, MEASURES)
     _draw(out, seeds[:SHEET_SCENES], spec)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib
 import numpy as np
@@ -34,27 +34,22 @@ def summaries(scores: Mapping[str, Scores], measures: Iterable[str]) -> Table:
     return {name: summarize(values, measures) for name, values in scores.items()}
 
 
-def differences_from(
-    reference: str, scores: Mapping[str, Scores], measures: Iterable[str]
+def differences(
+    scores: Mapping[str, Scores],
+    reference: str,
+    measures: Iterable[str],
+    *,
+    minus: Literal["reference", "row"] = "reference",
 ) -> Table:
-    """Return the paired differences of each method from a reference, for its measures."""
+    """Return the paired differences of each row and a reference, for the reference's measures."""
     start = scores[reference]
     shared = [measure for measure in measures if measure in start[0]]
-    return {
-        name: paired_differences(values, start, shared)
+    pairs = {
+        name: (values, start) if minus == "reference" else (start, values)
         for name, values in scores.items()
         if name != reference
     }
-
-
-def differences_of(name: str, scores: Mapping[str, Scores], measures: Iterable[str]) -> Table:
-    """Return the paired differences of one method from each other method."""
-    shared = [measure for measure in measures if measure in scores[name][0]]
-    return {
-        other: paired_differences(scores[name], values, shared)
-        for other, values in scores.items()
-        if other != name
-    }
+    return {name: paired_differences(*pair, shared) for name, pair in pairs.items()}
 
 
 def over_seeds(runs: Sequence[Scores], measures: Iterable[str]) -> list[dict[str, float]]:

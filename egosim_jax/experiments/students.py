@@ -16,7 +16,7 @@ from egosim_jax.experiments.config import Students
 from egosim_jax.experiments.continuous import by_clip, draw_curves, simulate
 from egosim_jax.experiments.report import (
     Scores,
-    differences_of,
+    differences,
     show,
     show_by_clip,
     summaries,
@@ -121,12 +121,12 @@ def _compare_clips(settings: Students, student: Generator, others: Iterator[Row]
         if not shown or name == STUDENT:
             shown[name] = videos
     table = summaries(scores, ROW_MEASURES)
-    differences = differences_of(STUDENT, scores, ROW_MEASURES)
+    gaps = differences(scores, STUDENT, ROW_MEASURES, minus="row")
     draw_scenes(settings.out / "contact_sheet.png", scenes, shown)
     show("mean ± spread over scenes", table, ROW_MEASURES)
     title = "the student's differences from each row, with their 95 % interval"
-    show(title, differences, ROW_MEASURES)
-    return {"definitions": ROW_DEFINITIONS, "table": table, "differences": differences}
+    show(title, gaps, ROW_MEASURES)
+    return {"definitions": ROW_DEFINITIONS, "table": table, "differences": gaps}
 
 
 def _color_error(video: np.ndarray, scene: HeldOutClip) -> float:
@@ -145,11 +145,11 @@ def _compare_loops(settings: Students, generators: Mapping[str, Generator]) -> d
         runs[name].append(
             simulate(generators[name], folder, seed=seed, clips=clips, perception="classical")
         )
-    tables, differences = by_clip(runs, "teacher")
+    tables, gaps = by_clip(runs, "teacher")
     for name, rows in tables.items():
         show_by_clip(f"{name} in the loop: mean ± spread", rows, LOOP_MEASURES)
     title = "student in the loop: difference from the teacher, with its 95 % interval"
-    show_by_clip(title, differences[STUDENT], LOOP_MEASURES)
+    show_by_clip(title, gaps[STUDENT], LOOP_MEASURES)
     draw_curves(tables, settings.out / "curves.png")
-    loop = {"definitions": LOOP_DEFINITIONS, "tables": tables, "differences": differences[STUDENT]}
+    loop = {"definitions": LOOP_DEFINITIONS, "tables": tables, "differences": gaps[STUDENT]}
     return {"loop": loop}

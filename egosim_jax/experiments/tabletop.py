@@ -8,7 +8,7 @@ from egosim_jax.experiments.config import Tabletop
 from egosim_jax.experiments.report import (
     Scores,
     Table,
-    differences_from,
+    differences,
     over_seeds,
     show,
     summarize_runs,
@@ -59,12 +59,12 @@ def run(settings: Tabletop) -> None:
         settings.out,
         definitions={**DEFINITIONS, **SPREAD, **DIFFERENCES},
         tables={kind: table for kind, (table, _) in compared.items()},
-        differences={kind: differences for kind, (_, differences) in compared.items()},
+        differences={kind: gaps for kind, (_, gaps) in compared.items()},
     )
-    for kind, (table, differences) in compared.items():
+    for kind, (table, gaps) in compared.items():
         show(f"{kind}: mean ± spread over scenes (± over seeds)", table, MEASURES)
         title = f"{kind}: what dropping a condition changes, with its 95 % interval"
-        show(title, differences, MEASURES)
+        show(title, gaps, MEASURES)
 
 
 def _compare(settings: Tabletop, kind: Kind, generator: Generator) -> tuple[Table, Table]:
@@ -91,4 +91,4 @@ def _compare(settings: Tabletop, kind: Kind, generator: Generator) -> tuple[Tabl
     runs |= {name: [evaluate(scenes, videos)] for name, videos in others.items()}
     table = {name: summarize_runs(scores, MEASURES) for name, scores in runs.items()}
     draw_scenes(settings.out / f"contact_sheet_{kind}.png", scenes, {"generated": generated})
-    return table, differences_from("full", by_scene, MEASURES)
+    return table, differences(by_scene, "full", MEASURES)

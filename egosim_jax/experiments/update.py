@@ -105,20 +105,15 @@ def evaluate(
         new = perceived.new_objects
         numbers = [n for n, points in new.items() if is_among(points, points_m).any()]
     still = (after.object_ids == 0) & is_among(after.points_m, points_m)
+    background = before.points_m[before.object_ids == 0]
+    rest = symmetric_distance(background, _background_seen_before(clip, after))
     carried = object_accuracy(
         points_m,
         after.points_m[still | np.isin(after.object_ids, numbers)],
         surface=(transform(path[-1], body.vertices_m), body.triangles),
         seen_m=_visible_surface(clip, number, path),
     )
-    background = before.points_m[before.object_ids == 0]
-    return {
-        "accuracy": carried.accurate,
-        "completeness": carried.complete,
-        "ghost": carried.ghost,
-        "background_mm": 1000
-        * symmetric_distance(background, _background_seen_before(clip, after)),
-    }
+    return {**carried, "background_mm": 1000 * rest}
 
 
 def _visible_surface(clip: TabletopClip, number: int, path: np.ndarray) -> np.ndarray:

@@ -18,8 +18,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from egosim_jax.geometry import invert, pixel_rays, project, transform, upsample_intrinsics
 from egosim_jax.robots.models import TABLE, RobotModel
 from egosim_jax.types import Cameras
-from egosim_jax.worlds.tabletop.embree import Rays
-from egosim_jax.worlds.tabletop.primitives import Mesh, cuboid, cylinder, sphere
+from egosim_jax.worlds.tabletop.embree import Mesh, Rays, make_mesh
 from egosim_jax.worlds.tabletop.raycast import AMBIENT, SUN, SUNLIGHT
 
 RAYS = 2
@@ -96,14 +95,14 @@ def _mesh_of(mj: Any, geom: int) -> Mesh | None:
         vertices = mj.mesh_vert[first : first + count].astype(float)
         return vertices, mj.mesh_face[face : face + faces].astype(int)
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
-        vertices, triangles = cuboid(2 * size)
+        vertices, triangles = make_mesh("box", *(2 * size))
         return vertices - size, triangles
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-        return sphere(size[0], SIDES // 2)
+        return make_mesh("sphere", size[0], SIDES // 2)
     if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        return cylinder(size[0], 2 * size[1], SIDES)
+        return make_mesh("cylinder", size[0], 2 * size[1], SIDES, 1)
     if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:  # a sphere whose halves are apart
-        vertices, triangles = sphere(size[0], SIDES // 2)
+        vertices, triangles = make_mesh("sphere", size[0], SIDES // 2)
         shift = np.sign(vertices[:, 2:]) * size[1] * np.array([0, 0, 1])
         return vertices + shift, triangles
     return None

@@ -21,9 +21,16 @@ from egosim_jax.train.online.latents import read_latents, write_shard
 from egosim_jax.train.online.plan import OnlineTraining
 from egosim_jax.train.online.pool import CHUNK, Pool, latent_shapes, raw_shapes
 from egosim_jax.train.online.run import OnlineRun, schedule
-from egosim_jax.train.online.scenes import EndlessScenes, queued, row_of, write_row
+from egosim_jax.train.online.scenes import (
+    REACH_M,
+    EndlessScenes,
+    make_idle,
+    queued,
+    row_of,
+    wander,
+    write_row,
+)
 from egosim_jax.types import InputError
-from egosim_jax.worlds.tabletop.idle import REACH_M, make_idle, wander
 
 DEBUG = configs.get("debug")
 SMALL = replace(DEBUG, video=replace(DEBUG.video, height=32, width=48))

@@ -4,7 +4,7 @@
 
 writes the clips of the scenes SEED, SEED + N, ... to the folder, each as one file that appears
 complete, and waits while the folder is full. A seed decides everything: the kind of hands, and
-whether the scene is a script, or an attempt, an encounter or idle (modules of `worlds/tabletop`).
+whether the scene is a script, an attempt, an encounter (modules of `worlds/tabletop`), or idle.
 """
 
 from __future__ import annotations
@@ -19,19 +19,25 @@ from typing import Any
 
 import numpy as np
 import tyro
+from jaxtyping import Float
 
 from egosim_jax import configs
 from egosim_jax.configs.model import ModelConfig
 from egosim_jax.generation.encoding import pack
 from egosim_jax.perception.oracle import OracleConfig
 from egosim_jax.state.fuse import fuse
-from egosim_jax.types import Clip, SceneState, Triplet
-from egosim_jax.worlds.tabletop import TabletopClip, make_scripts, make_sequence, state_after
+from egosim_jax.types import Action, Clip, Kind, SceneState, Triplet, VideoSpec
+from egosim_jax.worlds.tabletop import (
+    TabletopClip,
+    World,
+    make_scripts,
+    make_sequence,
+    state_after,
+)
 from egosim_jax.worlds.tabletop.attempts import make_attempts
 from egosim_jax.worlds.tabletop.clips import observation_of, to_action, to_triplet
 from egosim_jax.worlds.tabletop.dataset import conditions_of
 from egosim_jax.worlds.tabletop.encounters import make_encounters
-from egosim_jax.worlds.tabletop.idle import make_idle
 
 HELD_OUT = "held"
 """Prefix of the names of held-out clips in a queue."""
@@ -39,6 +45,15 @@ FUSED_EVERY = 4
 """Distance of the frames that are fused into a state."""
 MAX_QUEUED = 400
 """Number of files in a queue from which the processes wait."""
+STILL_HEAD, ABSENT, WANDERING = 0.4, 0.25, 0.4
+"""Probabilities of a head that is still, of absent hands, and of wandering ones."""
+STEP_M = 0.006
+"""Standard deviation of a wandering hand's change of speed along each axis, meters a frame."""
+REACH_M = 0.08
+"""Maximum distance of a wandering hand from its start along each axis, in meters."""
+ABSENT_PROMPT = "The wearer rests."
+RESTING_PROMPT = "The hand rests."
+"""Prompts of absent and of resting hands; every second clip has the script's prompt instead."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,6 +120,52 @@ class EndlessScenes:
                     state = state_after(before, state)
             yield to_triplet(clip, state, prior=prior, hands=hands, point_px=self.model.point_px)
             before = clip
+
+
+def make_idle(
+    seed: int, *, spec: VideoSpec, clips: int = 1, kind: Kind = "human", black_cloths: int = 0
+) -> Iterator[TabletopClip]:
+    """Yield the clips of a scene whose hands rest, are absent or wander, under any prompt.
+
+    In a script a hand always reaches for a body. A model trained only on scripts lets a resting
+    hand melt.
+    """
+    rng = np.random.default_rng([seed, 0 if kind == "human" else 1, 9])
+    script = next(
+        make_scripts(
+            seed,
+            spec=spec,
+            kind=kind,
+            black_cloths=black_cloths,
+            fixed_camera=bool(rng.random() < STILL_HEAD),
+        )
+    )
+    joints = np.repeat(script.action.joints_m[:1], spec.frames, axis=0)
+    prompt, choice = RESTING_PROMPT, rng.random()
+    wanders = ABSENT < choice < ABSENT + WANDERING
+    if choice < ABSENT:
+        joints, prompt = np.full_like(joints, np.nan), ABSENT_PROMPT
+    world = World(scene=script.scene, seed=seed)
+    for _ in range(clips):
+        if wanders:
+            joints = joints[-1:] + wander(spec.frames, rng)
+        action = Action(
+            cameras=script.cameras,
+            joints_m=joints,
+            kind=kind,
+            prompt=script.caption if wanders or rng.random() < 0.5 else prompt,
+        )
+        clip, world = world.execute(action)
+        yield clip
+
+
+def wander(frames: int, rng: np.random.Generator) -> Float[np.ndarray, "f 1 1 3"]:
+    """Return the offsets of a hand on a smooth random path from 0, in meters."""
+    speed = np.cumsum(rng.normal(0, STEP_M, (frames, 3)), axis=0)
+    path = np.cumsum(speed - speed[:1], axis=0) / np.sqrt(frames)
+    path = REACH_M * np.tanh(path / REACH_M)
+    path[:, 2] = np.maximum(path[:, 2], -0.02)  # a hand does not sink into the table
+    return path[:, None, None, :]
 
 
 def fused_after(clip: TabletopClip, state: SceneState, *, fps: int) -> SceneState:

@@ -168,4 +168,4 @@ def lpips(
 ) -> Float[Array, " n"]:
     """Return the distances of all b f frames."""
     images = (x.reshape(-1, *x.shape[2:]) for x in (decoded, video))
-    return Lpips.load("alex").compare(*images)
+    return Lpips.load("alex")(*images)

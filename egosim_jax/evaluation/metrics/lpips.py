@@ -153,10 +153,6 @@ class Lpips(nnx.Module):
 
     def __call__(self, a: Images, b: Images) -> Float[Array, " b"]:
         """Return the distance of each pair of images `b h w 3`, uint8 or in [-1, 1]."""
-        return _distances(*nnx.split(self), a, b)
-
-    def compare(self, a: Images, b: Images) -> Float[Array, " b"]:
-        """Return the distance of each pair, without compilation."""
         features = self.features(jnp.concatenate([a, b]))
         ours, theirs = zip(*(jnp.split(x, 2) for x in features), strict=True)
         return self.distances(ours, theirs)
@@ -178,11 +174,6 @@ class Lpips(nnx.Module):
         squares = (jnp.square(a - b) for a, b in zip(ours, theirs, strict=True))
         parts = [w(x).mean(axis=(1, 2, 3)) for w, x in zip(self.weights, squares, strict=True)]
         return functools.reduce(jnp.add, parts)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _distances(graph: nnx.GraphDef, state: nnx.State, a: Images, b: Images) -> Float[Array, " b"]:
-    return nnx.merge(graph, state).compare(a, b)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -228,11 +219,7 @@ def frame_distances(
     network: Lpips, video: UInt8[np.ndarray, "f h w 3"], reference: UInt8[np.ndarray, "f h w 3"]
 ) -> Float[np.ndarray, " f"]:
     """Return the distance of each frame of a video from the frame of a reference."""
-    check_same_shape(video, reference)
-    count, height, width, _ = video.shape
-    batches = Batches(count, MAX_PIXELS // (height * width))
-    pairs = zip(batches.of(video), batches.of(reference), strict=True)
-    return batches.join(network(a, b) for a, b in pairs)
+    return Reference(network, reference).distances(video)
 
 
 @functools.cache

@@ -60,7 +60,6 @@ def agreement(
     generated: Float[np.ndarray, "p s"],
     true: Float[np.ndarray, "p s"],
     *,
-    level: float = 0.95,
     resamples: int = 2000,
 ) -> dict[str, dict[str, float]]:
     """Return each measure of the success of p policies in s scenes.
@@ -70,16 +69,16 @@ def agreement(
     """
     means = generated.mean(axis=1), true.mean(axis=1)
     return {
-        "pearson": {"mean": pearson(*means), **_pearson_interval(generated, true, level)},
+        "pearson": {"mean": pearson(*means), **_pearson_interval(generated, true)},
         "spearman": {"mean": spearman(*means)},
-        "mmrv": {"mean": mmrv(*means), **_mmrv_interval(generated, true, level, resamples)},
+        "mmrv": {"mean": mmrv(*means), **_mmrv_interval(generated, true, resamples)},
     }
 
 
 def _pearson_interval(
-    generated: Float[np.ndarray, "p s"], true: Float[np.ndarray, "p s"], level: float
+    generated: Float[np.ndarray, "p s"], true: Float[np.ndarray, "p s"]
 ) -> dict[str, float]:
-    """Return the interval of the correlation of success over all scenes, by the jackknife.
+    """Return the 95 % interval of the correlation of success over all scenes, by the jackknife.
 
     The chance of a few scenes spreads the policies' shares and so lowers the correlation. Products
     of different scenes alone have the covariance of the expected shares as mean. If the scenes do
@@ -95,7 +94,7 @@ def _pearson_interval(
     if min(map(np.min, squares)) <= 0:
         return {"low": -1.0, "high": 1.0}
     all_scenes, *without_one = above / np.sqrt(squares[0] * squares[1])
-    half = stdtrit(scenes - 1, (1 + level) / 2) * (scenes - 1) * np.std(without_one)
+    half = stdtrit(scenes - 1, 0.975) * (scenes - 1) * np.std(without_one)
     half /= np.sqrt(scenes - 1)
     low, high = np.clip([all_scenes - half, all_scenes + half], -1, 1)
     return {"low": float(low), "high": float(high)}
@@ -115,7 +114,6 @@ def _covariances(
 def _mmrv_interval(
     generated: Float[np.ndarray, "p s"],
     true: Float[np.ndarray, "p s"],
-    level: float,
     resamples: int,
 ) -> dict[str, float]:
     """Return the interval by Student's t around the value less its bias, both by the bootstrap.
@@ -130,6 +128,6 @@ def _mmrv_interval(
     draws = np.random.default_rng(0).integers(scenes, size=(resamples, scenes))
     again = [mmrv(generated[:, d].mean(axis=1), true[:, d].mean(axis=1)) for d in draws]
     center = 2 * mmrv(generated.mean(axis=1), true.mean(axis=1)) - np.mean(again)
-    half = stdtrit(scenes - 1, (1 + level) / 2) * np.std(again)
+    half = stdtrit(scenes - 1, 0.975) * np.std(again)
     low, high = np.clip([center - half, center + half], 0, 1)
     return {"low": float(low), "high": float(high)}

@@ -189,13 +189,7 @@ class MotionDiT(CogVideoXDiT):
         cells = (len(base.rotation) - text.shape[1]) // frames
         texts = jnp.full(text.shape[1], frames)
         frame = jnp.concatenate([texts, jnp.repeat(jnp.arange(frames), cells)])
-        return MotionContext(
-            patches=base.patches,
-            text=base.text,
-            rotation=base.rotation,
-            motion=motion,
-            frame=frame,
-        )
+        return MotionContext(**vars(base), motion=motion, frame=frame)
 
     def modulators(self, time: Float[Array, "b e"], context: CogVideoXContext) -> Any:
         """Return the time embedding with the poses and the row of each token."""

@@ -17,9 +17,9 @@ Clips (`clips`)
     conversions; state_after: a state moved by the ground-truth motion
 
 Other modules: `dataset` makes shards; `attempts` makes clips in which hands may fail, `encounters`
-those in which they push, slip, hurry or are two, `idle` those in which they do nothing; `policies`
-has policies with faults; `hand_motion` plans hands; `contact`, `pushes` and `support` move bodies;
-`bodies`, `hands` and `solids` have the geometry; `raycast` renders.
+those in which they push, slip, hurry or are two; `policies` has policies with faults; `hand_motion`
+plans hands; `contact`, `pushes` and `support` move bodies; `bodies`, `hands` and `solids` have the
+geometry; `raycast` renders.
 """
 
 from egosim_jax.worlds.tabletop.clips import (

@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32, Int
 
 from egosim_jax.rendering.mesh import vertex_normals
 from egosim_jax.types import InputError
-from egosim_jax.worlds.tabletop.primitives import cone, cuboid, cylinder, sphere, torus
+from egosim_jax.worlds.tabletop.embree import Mesh, make_mesh
 
 Shape = Literal["box", "cylinder", "ball", "cone", "ring", "cup", "lidded box", "drawer"]
 LOOSE: tuple[Shape, ...] = ("box", "cylinder", "ball", "cone", "ring", "cup")
@@ -95,6 +95,15 @@ class Part:
     smooth: bool = False
     """Interpolate vertex normals, for round surfaces."""
 
+    @classmethod
+    def plain(
+        cls, name: str, mesh: Mesh, color: tuple[int, int, int], *, smooth: bool = False
+    ) -> Part:
+        """Return a part of one color."""
+        vertices, triangles = mesh
+        paint = Paint(color=color)
+        return cls(name=name, vertices_m=vertices, triangles=triangles, paint=paint, smooth=smooth)
+
     @cached_property
     def vertex_normals(self) -> Float32[np.ndarray, "v 3"]:
         """Area-weighted mean normal of the triangles of each vertex."""
@@ -136,9 +145,7 @@ class Body:
         return 0.55 * self.size_m[0] if self.shape == "cone" else self.size_m[0]
 
 
-def box(
-    low: tuple[float | int, ...], high: tuple[float | int, ...]
-) -> tuple[np.ndarray, np.ndarray]:
+def box(low: tuple[float | int, ...], high: tuple[float | int, ...]) -> Mesh:
     """Return the mesh of an axis-aligned box between two corners."""
     extent = np.subtract(high, low).astype(float)
     if (extent <= 0).any():
@@ -146,11 +153,11 @@ def box(
             f"The box from {low} to {high} is empty: each coordinate of the second corner must "
             "exceed the same coordinate of the first."
         )
-    vertices, triangles = cuboid(extent)
+    vertices, triangles = make_mesh("box", *extent)
     return vertices + np.array(low), triangles
 
 
-def join(*pieces: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def join(*pieces: Mesh) -> Mesh:
     """Concatenate meshes into one."""
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in pieces)])
     vertices = np.concatenate([vertices for vertices, _ in pieces])
@@ -192,28 +199,28 @@ def split_edges(
     return np.array(points), faces
 
 
-def _outline(shape: Shape, size: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
+def _outline(shape: Shape, size: tuple[float, float, float]) -> Mesh:
     """Return the mesh of a loose body."""
     x, y, z = size
     radius = x / 2
     if shape == "box":
         return box((-x / 2, -y / 2, 0), (x / 2, y / 2, z))
     if shape == "ball":
-        vertices, triangles = sphere(radius, 24)
+        vertices, triangles = make_mesh("sphere", radius, 24)
         return vertices + [0, 0, radius], triangles
     if shape == "ring":
         tube = z / 2
-        vertices, triangles = torus(radius - tube, tube, 40, 16)
+        vertices, triangles = make_mesh("torus", radius - tube, tube, 40, 16)
         return vertices + [0, 0, tube], triangles
     if shape == "cone":
-        return cone(radius, z, 40)
+        return make_mesh("cone", radius, z, 40)
     if shape == "cup":
         return _cup(radius, z)
-    vertices, triangles = cylinder(radius, z, 40)
+    vertices, triangles = make_mesh("cylinder", radius, z, 40, 1)
     return vertices + [0, 0, z / 2], triangles
 
 
-def _cup(outer: float, height: float) -> tuple[np.ndarray, np.ndarray]:
+def _cup(outer: float, height: float) -> Mesh:
     """Return the mesh of a cup: a cylinder that is open at the top."""
     angles = np.linspace(0, 2 * np.pi, 40, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
@@ -296,8 +303,8 @@ def make_drawer(color: str) -> Body:
         shape="drawer",
         size_m=(width, depth, height),
         parts=(
-            _plain_part("drawer", tray, (205, 190, 165)),
-            _plain_part("case", case, COLORS[color]),
+            Part.plain("drawer", tray, (205, 190, 165)),
+            Part.plain("case", case, COLORS[color]),
         ),
         world_from_body=np.eye(4),
     )
@@ -323,14 +330,8 @@ def make_lidded_box(color: str) -> Body:
         shape="lidded box",
         size_m=(width, depth, height + lid),
         parts=(
-            _plain_part("lid", cover, COLORS[color]),
-            _plain_part("case", case, darker(COLORS[color])),
+            Part.plain("lid", cover, COLORS[color]),
+            Part.plain("case", case, darker(COLORS[color])),
         ),
         world_from_body=np.eye(4),
     )
-
-
-def _plain_part(
-    name: str, shape: tuple[np.ndarray, np.ndarray], color: tuple[int, int, int]
-) -> Part:
-    return Part(name=name, vertices_m=shape[0], triangles=shape[1], paint=Paint(color=color))

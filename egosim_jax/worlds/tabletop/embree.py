@@ -1,19 +1,28 @@
-"""Rays cast among meshes by Embree, through Open3D."""
+"""Meshes of simple shapes, and rays cast among meshes by Embree, both through Open3D."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32
+from jaxtyping import Bool, Float, Float32, Int, Int32
 
 from egosim_jax.runtime.open3d import load_open3d
-from egosim_jax.worlds.tabletop.primitives import Mesh
 
+Mesh = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
+"""Vertices, and the vertex indices of each triangle, counterclockwise from outside."""
 UPWARD = (0.013, 0.007, 1.0)
 """Direction in which crossings are counted: along no edge of an upright shape."""
+
+
+def make_mesh(
+    shape: Literal["box", "sphere", "cylinder", "cone", "torus"], *sizes: float | int
+) -> Mesh:
+    """Return the mesh of a shape, by Open3D's `create_...` with the given sizes."""
+    mesh = getattr(load_open3d().geometry.TriangleMesh, f"create_{shape}")(*sizes)
+    return np.array(mesh.vertices), np.array(mesh.triangles, int)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -114,6 +114,10 @@ class Start:
         """Return a prompt of one hand."""
         return f"The {side} hand {words}" if self.kind == "human" else f"The gripper {words}"
 
+    def by_one_hand(self, path: list[Hand], words: str) -> Encounter:
+        """Return the encounter of one hand."""
+        return Encounter(scene=self.scene, hands=[path], prompt=self.says(path[0].side, words))
+
 
 def make_encounters(
     seed: int,
@@ -209,11 +213,7 @@ def push(start: Start) -> Encounter | None:
         (1.0, replace(grip, point_m=end - 0.05 * way + [0, 0, top])),
     ]
     words = f"pushes the {body.name} {hand_motion.direction(way)}."
-    return Encounter(
-        scene=start.scene,
-        hands=[through(keys, side, start.frames)],
-        prompt=start.says(side, words),
-    )
+    return start.by_one_hand(through(keys, side, start.frames), words)
 
 
 def two_hands(start: Start) -> Encounter | None:
@@ -252,7 +252,7 @@ def rider(start: Start) -> Encounter | None:
     intent = start.lift_or_carry(below)
     path = start.act(intent)
     words = intent.caption.replace(below.name, f"{below.name} with the {top.name} on it")
-    return Encounter(scene=start.scene, hands=[path], prompt=start.says(path[0].side, words))
+    return start.by_one_hand(path, words)
 
 
 def take_off(start: Start) -> Encounter | None:
@@ -268,7 +268,7 @@ def take_off(start: Start) -> Encounter | None:
     path = start.act(intent)
     old = f"picks up the {top.name}"
     words = intent.caption.replace(old, f"takes the {top.name} off the {below.name}")
-    return Encounter(scene=start.scene, hands=[path], prompt=start.says(path[0].side, words))
+    return start.by_one_hand(path, words)
 
 
 def fast(start: Start) -> Encounter | None:
@@ -286,8 +286,7 @@ def fast(start: Start) -> Encounter | None:
     ]
     path = [path[round(time * (FINE - 1))] for time in times]
     path += path[-1:] * (start.frames - half)
-    prompt = start.says(path[0].side, intent.caption)
-    return Encounter(scene=start.scene, hands=[path], prompt=prompt)
+    return start.by_one_hand(path, intent.caption)
 
 
 def miss(start: Start) -> Encounter | None:
@@ -302,11 +301,10 @@ def miss(start: Start) -> Encounter | None:
     if fist:
         begin, end = _holding(start, intent, path[0])
         path = [
-            _with_closure(hand, 1.0) if begin < time < end else hand
+            hand.with_closure(1.0) if begin < time < end else hand
             for hand, time in zip(path, np.linspace(0, 1, start.frames), strict=True)
         ]
-    prompt = start.says(path[0].side, intent.caption)
-    return Encounter(scene=start.scene, hands=[path], prompt=prompt)
+    return start.by_one_hand(path, intent.caption)
 
 
 def slip(start: Start) -> Encounter | None:
@@ -317,13 +315,12 @@ def slip(start: Start) -> Encounter | None:
     moment, late = begin + start.rng.uniform(0.15, 0.7) * (end - begin), start.chance(0.5)
     wide = hand_motion.opened(start.kind)
     path = [
-        _with_closure(hand, min(hand.grip.closure, wide))
+        hand.with_closure(min(hand.grip.closure, wide))
         if begin - hand_motion.CLOSE_SHARE < time < end and late == (time < moment)
         else hand
         for hand, time in zip(path, np.linspace(0, 1, start.frames), strict=True)
     ]
-    prompt = start.says(path[0].side, intent.caption)
-    return Encounter(scene=start.scene, hands=[path], prompt=prompt)
+    return start.by_one_hand(path, intent.caption)
 
 
 ENCOUNTERS: tuple[Callable[[Start], Encounter | None], ...] = (
@@ -390,7 +387,3 @@ def _stack(start: Start) -> tuple[Start, Body, Body] | None:
 
 def _holding(start: Start, intent: Intent, hand: Hand) -> tuple[float, float]:
     return hand_motion.holding(start.scene, hand, intent, start.kind)
-
-
-def _with_closure(hand: Hand, closure: float) -> Hand:
-    return replace(hand, grip=replace(hand.grip, closure=closure))

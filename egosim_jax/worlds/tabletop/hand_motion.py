@@ -72,6 +72,10 @@ class Hand:
     grip: Grip
     """Configuration of the hand."""
 
+    def with_closure(self, closure: float) -> Hand:
+        """Return the hand with another closure."""
+        return replace(self, grip=replace(self.grip, closure=closure))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Intent:

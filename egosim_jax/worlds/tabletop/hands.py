@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float
 from egosim_jax.rendering.mesh import Side
 from egosim_jax.rendering.skeleton import SKELETONS
 from egosim_jax.types import JOINTS, Kind
-from egosim_jax.worlds.tabletop.bodies import Paint, Part, join
-from egosim_jax.worlds.tabletop.primitives import sphere
+from egosim_jax.worlds.tabletop.bodies import Part, join
+from egosim_jax.worlds.tabletop.embree import Mesh, make_mesh
 
 KNUCKLES_M = np.array([[-0.026, 0.090, 0.0], [-0.004, 0.094, 0.002], [0.017, 0.088, 0.0],
                        [0.036, 0.078, -0.004]])  # fmt: skip
@@ -208,8 +208,8 @@ def hand_meshes(
             _limb(wrist - 0.02 * along, knuckle, 0.026, 0.026), _limb(wrist, elbow_m, 0.027, 0.034)
         )
         return (
-            _part("gripper", join(*fingers), RUBBER),
-            _part("wrist", join(palm, arm), ENAMEL),
+            Part.plain("gripper", join(*fingers), RUBBER, smooth=True),
+            Part.plain("wrist", join(palm, arm), ENAMEL, smooth=True),
         )
     radii = np.array([0.026, 0.016, 0.0125, 0.0115, 0.0095] + [0.0105, 0.0095, 0.0085, 0.0075] * 4)
     pieces = [
@@ -228,19 +228,12 @@ def hand_meshes(
     cuff = wrist + 0.07 * towards
     pieces += [_limb(wrist, cuff, 0.023, 0.025)]
     return (
-        _part("hand", join(*pieces), SKIN),
-        _part("forearm", _limb(cuff, elbow_m, 0.029, 0.038), SLEEVE),
+        Part.plain("hand", join(*pieces), SKIN, smooth=True),
+        Part.plain("forearm", _limb(cuff, elbow_m, 0.029, 0.038), SLEEVE, smooth=True),
     )
 
 
-def _part(name: str, shape: tuple[np.ndarray, np.ndarray], color: tuple[int, int, int]) -> Part:
-    paint = Paint(color=color)
-    return Part(name=name, vertices_m=shape[0], triangles=shape[1], paint=paint, smooth=True)
-
-
-def _limb(
-    start: np.ndarray, end: np.ndarray, first: float, last: float
-) -> tuple[np.ndarray, np.ndarray]:
+def _limb(start: np.ndarray, end: np.ndarray, first: float, last: float) -> Mesh:
     """Return the mesh of a capsule between two points with a radius at each end."""
     ball, faces = _unit_ball()
     along = end - start
@@ -261,5 +254,5 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 @cache
-def _unit_ball() -> tuple[np.ndarray, np.ndarray]:
-    return sphere(1.0, 8)
+def _unit_ball() -> Mesh:
+    return make_mesh("sphere", 1.0, 8)

@@ -14,7 +14,6 @@ from jaxtyping import Float
 
 from egosim_jax.worlds.tabletop import hand_motion
 from egosim_jax.worlds.tabletop.bodies import Body
-from egosim_jax.worlds.tabletop.hand_motion import Hand
 from egosim_jax.worlds.tabletop.sequence import Script
 
 MAX_ERROR_M = (0.03, 0.02)
@@ -60,14 +59,12 @@ class Policy:
         opens = begin if not self.grasps else begin + self.release * (end - begin)
         times, wide = np.linspace(0, 1, frames), hand_motion.opened(kind)
         hands = [
-            _opened(moment.hands[0], wide) if time >= opens and opens < end else moment.hands[0]
-            for moment, time in zip(moments, times, strict=True)
+            hand.with_closure(min(hand.grip.closure, wide))
+            if time >= opens and opens < end
+            else hand
+            for hand, time in zip((m.hands[0] for m in moments), times, strict=True)
         ]
         return np.array([[h.grip.pose(kind, h.side)[0]] for h in hands])
-
-
-def _opened(hand: Hand, closure: float) -> Hand:
-    return replace(hand, grip=replace(hand.grip, closure=min(hand.grip.closure, closure)))
 
 
 POLICIES = (

@@ -11,8 +11,9 @@ from PIL import Image
 
 from egosim_jax.cli.evaluate import Evaluate
 from egosim_jax.cli.table import TableCommand
+from egosim_jax.evaluation.methods import WHOLE, Edges
 from egosim_jax.evaluation.metrics import lpips
-from egosim_jax.evaluation.registration import WHOLE, Edges, find_crop
+from egosim_jax.evaluation.registration import find_crop
 from egosim_jax.io.writing import write_video
 from egosim_jax.runtime.command import ExitCode
 

@@ -12,7 +12,7 @@ from egosim_jax.robots.background import first_cloud, moved, remove_hands
 from egosim_jax.robots.drawing import SHADOW, draw
 from egosim_jax.state.depth import state_from_depth
 from egosim_jax.types import Cameras, GroundTruth
-from egosim_jax.worlds.tabletop.primitives import sphere
+from egosim_jax.worlds.tabletop.embree import make_mesh
 
 HEIGHT, WIDTH, FRAMES = 24, 32, 3
 GRAY, RED, SKIN = (120, 120, 120), (200, 40, 40), (216, 150, 118)
@@ -126,7 +126,7 @@ def test_objects_are_where_the_clip_left_them(cameras):
 @pytest.mark.parametrize(("height_m", "seen"), [(0.3, True), (-0.3, False)])
 def test_a_robot_hides_only_what_is_behind_it(cameras, height_m, seen):
     _, clean = scene(cameras)
-    vertices, triangles = sphere(0.1, 12)
+    vertices, triangles = make_mesh("sphere", 0.1, 12)
     ball = (vertices + [0, 0, height_m], triangles)
     drawn = draw(
         clean.frames[:1], clean.depth_m[:1], cameras, [[ball]], [np.array([0.0, 0, 1])],
@@ -142,7 +142,7 @@ def test_a_robot_hides_only_what_is_behind_it(cameras, height_m, seen):
 
 def test_a_robot_near_the_table_darkens_it(cameras):
     _, clean = scene(cameras)
-    vertices, triangles = sphere(0.1, 12)
+    vertices, triangles = make_mesh("sphere", 0.1, 12)
     plain = np.full_like(clean.frames[:1], 200)
     drawn = draw(
         plain, clean.depth_m[:1], cameras, [[(vertices + [0, 0, 0.1], triangles)]],

@@ -33,20 +33,18 @@ def judged(after):
 
 
 def test_an_object_that_moved_completely_is_accurate_and_complete():
-    found = judged(top() + AT)
-    assert (found.accurate, found.complete, found.ghost) == (100, 100, 0)
+    assert judged(top() + AT) == {"accuracy": 100, "completeness": 100, "ghost": 0}
 
 
 def test_a_ghost_is_inaccurate_and_remains():
-    found = judged(top())
-    assert (found.accurate, found.complete, found.ghost) == (0, 0, 100)
+    assert judged(top()) == {"accuracy": 0, "completeness": 0, "ghost": 100}
 
 
 def test_half_an_object_is_half_complete():
     points = top() + AT
     found = judged(points[points[:, 0] < AT[0]])
-    assert found.accurate == 100
-    assert found.complete == pytest.approx(60, abs=3)  # one more centimeter counts as known
+    assert found["accuracy"] == 100
+    assert found["completeness"] == pytest.approx(60, abs=3)  # one more centimeter counts as known
 
 
 def test_distances_are_those_to_the_surface_inside_and_outside():
