@@ -77,7 +77,7 @@ def test_a_worker_stays_warm_and_survives_what_it_refuses(worker):
 
 
 def test_a_dead_worker_reports_its_last_output_and_the_next_call_starts_another(worker):
-    with pytest.raises(NetworkError, match=r"(?s)signal 9.*last words") as error:
+    with pytest.raises(NetworkError, match=r"(?s)SIGKILL.*last words") as error:
         ask(worker, die=True)
     assert error.value.code == ExitCode.FAILED
     assert ask(worker)[1]["calls"] == 1
