@@ -65,6 +65,10 @@ class Worker:
         with self._lock:
             try:
                 reply = self._child.call(answer, *request, timeout_s=timeout_s)
+            except InputError:
+                if not self._child.call(is_loaded, self._module, timeout_s=timeout_s):
+                    self._child.close()  # it refused its folder or device, and is of no use
+                raise
             except TimeoutError:
                 raise NetworkError(
                     f"{name} did not finish in {timeout_s:g} s: its worker process was ended. "
@@ -88,6 +92,11 @@ class Worker:
 
 _NETWORKS: dict[str, Run] = {}
 """Network of this process by its module, in a worker."""
+
+
+def is_loaded(module: str) -> bool:
+    """Return True in a worker that has loaded a network."""
+    return module in _NETWORKS
 
 
 def answer(
