@@ -40,7 +40,7 @@ from egosim_jax.io.bounded import quote, quote_path, read_json
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.journal import Journal
 from egosim_jax.io.run import plain, write_json
-from egosim_jax.simulation.rollout import RecordedClip, Rollout, load_clip
+from egosim_jax.simulation.rollout import Rollout, load_clip
 from egosim_jax.simulation.start import Start
 from egosim_jax.simulation.streams import Latency, Show
 from egosim_jax.state import snapshot
@@ -316,13 +316,14 @@ class Session:
         folder, action, now = self._step(number), self.action(number), self.now
         simulator = replace(self.backend.simulator(now), show=show)
         generator = simulator.generator
-        if frames is not None:
-            made = RecordedClip(generator=generator, frames=frames)
-            simulator = replace(simulator, generator=made)
         with announced(generator) if frames is None else nullcontext():
             name = f"session {self.id}, step {number}"
             (step,) = Rollout(simulator, folder / "rollout", name=name).run(
-                now.state, [action], seed=now.seed + now.steps, first_frame=now.first_frame
+                now.state,
+                [action],
+                seed=now.seed + now.steps,
+                first_frame=now.first_frame,
+                frames=frames,
             )
         request = self._request(number)
         info = {
