@@ -10,7 +10,8 @@ import numpy as np
 
 from egosim_jax.geometry import invert, look_at, pixel_rays, transform
 from egosim_jax.rendering.reference import draw_hands
-from egosim_jax.types import Action, Cameras
+from egosim_jax.types import Action
+from tests.scenes import pinhole
 
 EYE = np.array([0.0, -0.25, 0.45])
 TABLE_FROM_CAMERA = look_at(EYE, np.array([0.0, 0.12, 0.0]), up=np.array([0.0, 0.0, 1.0]))
@@ -38,15 +39,7 @@ ROOM = (TOP, BACK)
 
 def cameras(frames, height=96, width=160):
     """Cameras at rest, with the field of view of the tabletop world."""
-    focal = 0.866 * width
-    return Cameras(
-        world_from_camera=np.tile(np.eye(4), (frames, 1, 1)),
-        intrinsics_px=np.array(
-            [[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]]
-        ),
-        height=height,
-        width=width,
-    )
+    return pinhole(frames, 0.866 * width, height, width)
 
 
 def cast(boxes, view):

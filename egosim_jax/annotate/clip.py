@@ -16,12 +16,10 @@ import time
 import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
 
 from egosim_jax.annotate import record as records
 from egosim_jax.annotate.config import AnnotateConfig, Estimators
@@ -42,6 +40,7 @@ from egosim_jax.runtime.failures import system_failure
 from egosim_jax.runtime.phases import phase
 from egosim_jax.state import snapshot
 from egosim_jax.types import InputError
+from egosim_jax.types.arrays import Masks
 
 ANNOTATION, SHEET, WORK = "annotation.json", "sheet.jpg", "work"
 MASKS = "masks.npz"
@@ -212,15 +211,11 @@ def _stored(
         folder / f"{stage.name}.npz",
         make=lambda: stage.run(record, estimators, config),
         save=lambda path, result: records.save(path, result, stage.stored, stage.name),
-        load=partial(_load, record=record, stage=stage),
+        load=lambda path: records.load(path, record, stage.stored, stage.name),
     )
 
 
-def _load(path: Path, *, record: Record, stage: Stage) -> Record:
-    return records.load(path, record, stage.stored, stage.name)
-
-
-def write_masks(path: Path, hands: Bool[np.ndarray, "f h w"]) -> None:
+def write_masks(path: Path, hands: Masks) -> None:
     """Write the pixels of hands, eight in a byte: compressed if they are read so."""
     bits = np.packbits(hands, axis=2)
     write = np.savez_compressed if bits.nbytes < MAX_PACKED_BYTES else np.savez
@@ -228,7 +223,7 @@ def write_masks(path: Path, hands: Bool[np.ndarray, "f h w"]) -> None:
         write(temporary, hands=bits)
 
 
-def read_masks(path: Path, shape: tuple[int, int, int]) -> Bool[np.ndarray, "f h w"]:
+def read_masks(path: Path, shape: tuple[int, int, int]) -> Masks:
     """Read the pixels of hands in frames of this shape. Raises `InputError` if they differ."""
     bits = read_arrays(path, {"hands": "uint8"}, packed=True)["hands"]
     frames, height, width = shape

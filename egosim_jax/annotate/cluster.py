@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import logging
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
@@ -27,36 +27,23 @@ from egosim_jax.types import InputError
 
 ADDRESS = "RAY_ADDRESS"
 """Environment variable with the cluster address of a submitted job."""
-
-
 LOOPBACK = "127.0.0.1"
 
 
-class FirstStages:
-    """Ray actor for the first stages, which need no cameras; it maps rows of clips."""
+class Stages:
+    """Ray actor that maps rows of clips: the first stages, or the others and the clip's files."""
 
-    def __init__(self, out: str, config: AnnotateConfig):
-        self._out, self._config, self._estimators = Path(out), config, config.build()
-
-    def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
-        """Return the row with the clip's status."""
-        status = clip.annotate(
-            _job(row), self._out, self._config, self._estimators, first_only=True
-        )
-        return {**row, "status": status}
-
-
-class LastStages(FirstStages):
-    """Ray actor for the other stages; it also writes the clips."""
+    def __init__(self, out: str, config: AnnotateConfig, first_only: bool):
+        self._settings = Path(out), config, config.build()
+        self._first_only = first_only
 
     def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
         """Return the row with the clip's status."""
         if row["status"] == "failed":
             return row
-        return {
-            **row,
-            "status": clip.annotate(_job(row), self._out, self._config, self._estimators),
-        }
+        job = Job(**json.loads(row["job"]))
+        status = clip.annotate(job, *self._settings, first_only=self._first_only)
+        return {**row, "status": status}
 
 
 def annotate_on_ray(
@@ -77,7 +64,11 @@ def annotate_on_ray(
             "Ray is not installed: --ray needs it. Run pip install 'egosim-jax[cluster]'."
         )
     out = out.resolve()
-    rows = [_row(job) for job in jobs if not clip.is_final(job, out)]
+    rows = [
+        {"video_id": job.video_id, "job": json.dumps(asdict(job)), "status": ""}
+        for job in jobs
+        if not clip.is_final(job, out)
+    ]
     yield from ["done"] * (len(jobs) - len(rows))
     if not rows:
         return
@@ -86,10 +77,10 @@ def annotate_on_ray(
 
     try:
         data = ray.data.from_items(rows, override_num_blocks=min(len(rows), 1000))
-        for stage, gpu, max_actors in zip((FirstStages, LastStages), gpus, actors, strict=True):
+        for first_only, gpu, max_actors in zip((True, False), gpus, actors, strict=True):
             data = data.map(
-                cast(Any, stage),
-                fn_constructor_args=(str(out), config),
+                cast(Any, Stages),
+                fn_constructor_args=(str(out), config, first_only),
                 compute=ray.data.ActorPoolStrategy(min_size=1, max_size=max(1, max_actors)),
                 num_gpus=gpu or None,
             )
@@ -123,11 +114,3 @@ def _connect(address: str) -> None:
             "version of Ray, or an earlier import of Ray. Start a cluster yourself and give its "
             "address. (--ray)"
         )
-
-
-def _row(job: Job) -> dict[str, Any]:
-    return {"video_id": job.video_id, "job": json.dumps(asdict(job)), "status": ""}
-
-
-def _job(row: Mapping[str, Any]) -> Job:
-    return Job(**json.loads(row["job"]))

@@ -24,6 +24,7 @@ from egosim_jax.data.crop import Crop, plan_crop
 from egosim_jax.data.recording import Recording
 from egosim_jax.io.bounded import quote_path
 from egosim_jax.types import WAN_GRID, InputError, check_counts
+from egosim_jax.types.arrays import RgbImage, Video
 
 MAX_FPS = 60
 """Maximum frame rate of clips in frames per second."""
@@ -85,7 +86,7 @@ class Plan(Crop):
         return np.array([int(time + Fraction(1, 2)) for time in times])
 
     @no_type_check
-    def fit(self, frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "height width 3"]:
+    def fit(self, frame: RgbImage) -> UInt8[np.ndarray, "height width 3"]:
         """Return a frame of the video, resized (by area if smaller) and cropped."""
         import cv2
 
@@ -176,9 +177,7 @@ def _own_size(info: Recording) -> tuple[int, int]:
     return height, width
 
 
-def read_frames(
-    recording: Recording, fitted: Plan, start: int, stop: int
-) -> UInt8[np.ndarray, "f h w 3"]:
+def read_frames(recording: Recording, fitted: Plan, start: int, stop: int) -> Video:
     """Return frames `start` to `stop` at the clips' frame rate and size.
 
     Raises `InputError` if the video is damaged.
@@ -189,7 +188,7 @@ def read_frames(
 
 def read_searched_frames(
     recording: Recording, wanted: Int[np.ndarray, " f"], fitted: Plan
-) -> UInt8[np.ndarray, "f h w 3"] | None:
+) -> Video | None:
     """Return some frames of the video without a crop, for a search of hands.
 
     They are reduced to 1280 pixels on the longer side, and to 768 MiB in all. Return None if they
@@ -212,7 +211,7 @@ def read_searched_frames(
 
 def _read(
     recording: Recording, wanted: np.ndarray, each: Callable[[np.ndarray], np.ndarray]
-) -> UInt8[np.ndarray, "f h w 3"]:
+) -> Video:
     """Return frames of a recording, each changed by a function, decoded in parts."""
     frames = np.empty((len(wanted), 0, 0, 3), np.uint8)
     for first in range(wanted[0], wanted[-1] + 1, CHUNK):

@@ -7,13 +7,14 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool
 
 from egosim_jax.annotate.config import Side
 from egosim_jax.annotate.prepare import RefusedError
 from egosim_jax.dynamics.hands import PALM
 from egosim_jax.io.bounded import unlike
 from egosim_jax.perception.video.estimates import LEFT, RIGHT, HandTracks
+from egosim_jax.types.arrays import Video
 
 MAX_BOTH = 0.1
 """Maximum fraction of frames with two hands in a clip whose one hand has a given side."""
@@ -104,9 +105,7 @@ def hold_hands(hands: HandTracks, fps: Fraction) -> HandTracks:
     return replace(hands, joints_px=joints_px, joints_hand_m=joints_hand_m)
 
 
-def before_entry(
-    hands: HandTracks, frames: UInt8[np.ndarray, "f h w 3"]
-) -> Bool[np.ndarray, "f 2"]:
+def before_entry(hands: HandTracks, frames: Video) -> Bool[np.ndarray, "f 2"]:
     """Return True for hands that are not in the first frame, but enter soon after.
 
     The first frame shows something else where the hand is found first. Its silhouette must not be

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from egosim_jax.annotate.to_episode import crop_to
+from egosim_jax.annotate.to_episode import crop_to, kind_of, pick_clips
 from egosim_jax.data.lerobot_writer import HANDS, INTRINSICS, POSES, SCENE
 from egosim_jax.data.readers.lerobot import rate_of, read_info, read_rows, read_tasks
 from egosim_jax.io.bounded import quote, quote_path
 from egosim_jax.io.timing import Timeline, row_times
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.simulation.start import Start
-from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, SceneState, VideoSpec
+from egosim_jax.types import JOINTS, Action, Cameras, InputError, SceneState, VideoSpec
 
 logger = logging.getLogger(__name__)
 
@@ -56,7 +56,7 @@ def episode_from_lerobot(
     state, image = _scene(root / SCENE.format(number), state)
     joints, poses = _joints(rows[HANDS]), _numbers(rows[POSES], (4, 4), POSES)
     lens = _numbers(rows[INTRINSICS], (3, 3), INTRINSICS)
-    if _kind(joints.shape[2]) == "human" and len(poses) > 1 and (poses == poses[0]).all():
+    if kind_of(joints) == "human" and len(poses) > 1 and (poses == poses[0]).all():
         logger.warning(
             "Episode %d of %s has the same camera pose in all frames: the camera is at rest, or "
             "its poses are placeholders", number, quote_path(root),
@@ -75,16 +75,8 @@ def episode_from_lerobot(
     if stamps := rows.get("timestamp"):
         order, _, timeline = row_times(stamps, [fps], f"Episode {number} of {name}")
         moments = order[timeline.at_rate(video.fps)]
-    step = video.frames - 1
-    possible = (len(moments) - 1) // step
-    if not 0 < (count := possible if clips is None else clips) <= possible:
-        raise InputError(
-            f"Episode {number} of {quote_path(root)} has {len(moments)} frames at {video.fps} fps, "
-            f"enough for {possible} clips of {video.frames} frames, not {count}. (--clips, "
-            "--config)"
-        )
+    picked = pick_clips(moments, video, clips, name=f"Episode {number} of {name}")
     texts = read_tasks(root)
-    picked = [moments[n * step : n * step + video.frames] for n in range(count)]
     return Episode(
         state=state,
         actions=tuple(
@@ -96,7 +88,7 @@ def episode_from_lerobot(
                     width=video.width,
                 ),
                 joints_m=joints[k],
-                kind=_kind(joints.shape[2]),
+                kind=kind_of(joints),
                 prompt=texts.get(rows["task_index"][k[0]], ""),
             )
             for k in picked
@@ -132,10 +124,6 @@ def _size(features: dict[str, Any], video: VideoSpec) -> tuple[int, int]:
             "size. Remove the other cameras."
         )
     return next(iter(sizes), (video.height, video.width))
-
-
-def _kind(joints: int) -> Kind:
-    return next(kind for kind, count in JOINTS.items() if count == joints)
 
 
 def _joints(rows: Sequence[Any]) -> Float[np.ndarray, "f n j 3"]:

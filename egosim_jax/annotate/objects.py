@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Bool, Int32
+from jaxtyping import Int32
 
 from egosim_jax.annotate.config import AnnotateConfig, Estimators
 from egosim_jax.annotate.hand_tracks import visible
 from egosim_jax.annotate.record import Record
 from egosim_jax.types import object_name
+from egosim_jax.types.arrays import Mask
 
 MOVED = "moved object"
 """Name of an object that a hand moves, if no network names it."""
@@ -56,9 +57,7 @@ def find_moved_objects(record: Record, estimators: Estimators, config: AnnotateC
     )  # fmt: skip
 
 
-def measured(
-    standing: Int32[np.ndarray, "h w"], confident: Bool[np.ndarray, "h w"]
-) -> Int32[np.ndarray, "h w"]:
+def measured(standing: Int32[np.ndarray, "h w"], confident: Mask) -> Int32[np.ndarray, "h w"]:
     """Return the objects whose depth is confident in half of their pixels; the others become 0.
 
     Completed depth has bumps on walls and at the image border that look like objects.

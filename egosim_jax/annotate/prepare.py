@@ -23,6 +23,7 @@ from egosim_jax.annotate.frames import CHUNK, MAX_CLIP_FRAMES, Plan
 from egosim_jax.data.recording import Recording
 from egosim_jax.io.bounded import unlike
 from egosim_jax.types import WAN_GRID, InputError
+from egosim_jax.types.arrays import RgbImage
 
 THUMB_PX = 160
 """Width in pixels of the thumbnails for changes and motion."""
@@ -158,7 +159,7 @@ def scan(recording: Recording, fitted: Plan) -> Scan:
     cells: deque[np.ndarray] = deque(maxlen=max(4, round(LAG_S * fps) + 1))
     height = max(16, round(SHARP_PX * fitted.height / fitted.width))
 
-    def thumb(frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
+    def thumb(frame: RgbImage) -> UInt8[np.ndarray, "_ _ 3"]:
         return cv2.resize(frame, (SHARP_PX, height), interpolation=cv2.INTER_AREA)
 
     for first in range(0, fitted.count, CHUNK):

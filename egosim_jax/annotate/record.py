@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int32, UInt8
+from jaxtyping import Float, Int, Int32, UInt8
 
 from egosim_jax.annotate.frames import Plan
 from egosim_jax.data.recording import Recording
@@ -32,6 +32,7 @@ from egosim_jax.perception.video.estimates import (
     Verdict,
 )
 from egosim_jax.types import Cameras, InputError, SceneState
+from egosim_jax.types.arrays import Masks, Matrix
 
 _CLASSES = {
     "hands": HandTracks,
@@ -101,17 +102,17 @@ class Record:
         return self.require("estimate").cameras
 
     @property
-    def moving(self) -> Bool[np.ndarray, "f h w"]:
+    def moving(self) -> Masks:
         """Pixels of hands and arms."""
         return self.require("object_ids") < 0
 
     @property
-    def moved(self) -> Bool[np.ndarray, "f h w"]:
+    def moved(self) -> Masks:
         """Pixels of objects that hands move, after the stage `objects`."""
         return np.isin(self.require("object_ids"), self.require("moved_ids"))
 
     @property
-    def intrinsics(self) -> Float[np.ndarray, "3 3"] | None:
+    def intrinsics(self) -> Matrix | None:
         """Intrinsics of the clip in pixels, if the recording has them."""
         given = self.recording.intrinsics_px
         return None if given is None else self.plan.intrinsics(given)

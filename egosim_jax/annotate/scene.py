@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 
 from egosim_jax.annotate.captions import RULE, caption_by_rule
 from egosim_jax.annotate.config import AnnotateConfig, Estimators
@@ -22,6 +22,7 @@ from egosim_jax.annotate.stages import (
     find_depth,
     find_hands,
     joints_in_world,
+    lifted_hands,
     undistort_clip,
 )
 from egosim_jax.data.clip_files import prior_column
@@ -35,6 +36,7 @@ from egosim_jax.rendering.reference import splat
 from egosim_jax.state.depth import state_from_depth
 from egosim_jax.state.instances import find_objects
 from egosim_jax.types import Action, Motion, SceneState, Triplet
+from egosim_jax.types.arrays import Masks, Video
 
 MIN_FIXED_DB = 16.0
 """Minimum PSNR of the background if the camera stays in its place, in decibels."""
@@ -49,7 +51,7 @@ def find_scale(record: Record, estimators: Estimators, config: AnnotateConfig) -
     from egosim_jax.perception.video.scale import Scale, estimate_scale, scale_cameras, scale_depth
 
     estimate, depth = record.require("estimate"), record.require("depth")
-    joints = None if record.hands is None else _lifted(record)
+    joints = None if record.hands is None else lifted_hands(record)
     still = depth.metric and not estimate.metric and estimate.points is None
     if still and config.scale is None:
         scale = Scale(
@@ -76,13 +78,6 @@ def find_scale(record: Record, estimators: Estimators, config: AnnotateConfig) -
     return replace(record, joints_m=joints_in_world(record))
 
 
-def _lifted(record: Record) -> Float[np.ndarray, "f 2 21 3"]:
-    """Return the hands in meters, in the camera of each frame."""
-    from egosim_jax.perception.video.hands import lift, steady
-
-    return steady(lift(record.require("hands"), record.cameras.intrinsics_px), record.fps)
-
-
 def refine_scale(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
     """Scale the scene so that fingertips have the depth of the objects that they start to move.
 
@@ -96,9 +91,8 @@ def refine_scale(record: Record, estimators: Estimators, config: AnnotateConfig)
     if record.notes["scale"]["source"] != "hands" or joints_m is None or not len(contacts):
         return record
     depth = record.require("depth")
-    scale = contact_scale(
-        record.cameras, depth.depth_m[0], record.require("object_ids")[0], _lifted(record), contacts
-    )
+    ids, hands_m = record.require("object_ids")[0], lifted_hands(record)
+    scale = contact_scale(record.cameras, depth.depth_m[0], ids, hands_m, contacts)
     if scale is None:
         return record
     factor = scale.meters_per_unit
@@ -262,10 +256,10 @@ def to_triplet(record: Record, config: AnnotateConfig) -> tuple[Triplet, dict[st
 def _render(
     record: Record, config: AnnotateConfig
 ) -> tuple[
-    UInt8[np.ndarray, "f h w 3"],
+    Video,
     UInt8[np.ndarray, "f h w"],
-    UInt8[np.ndarray, "f h w 3"],
-    Bool[np.ndarray, "f h w"],
+    Video,
+    Masks,
 ]:
     """Return prior, mask, hands, and the pixels with a point, rendered in chunks to save memory."""
     from egosim_jax import rendering
@@ -300,11 +294,7 @@ def _motion(record: Record) -> Motion:
     return predict(record.require("state"), action, fps=round(record.fps) or 1)
 
 
-def _psnr(
-    video: UInt8[np.ndarray, "f h w 3"],
-    target: UInt8[np.ndarray, "f h w 3"],
-    judged: Bool[np.ndarray, "f h w"],
-) -> float:
+def _psnr(video: Video, target: Video, judged: Masks) -> float:
     """Return the PSNR over the judged pixels, mean over frames; 0 without such pixels."""
     errors = [
         np.square(frame[here].astype(np.float32) - other[here]).mean(dtype=np.float64)

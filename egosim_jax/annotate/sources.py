@@ -96,7 +96,7 @@ def _with_depth(recording: Recording, folder: Path) -> Recording:
         if files:
             info = probe_video(recording.video)
             files = by_frame(files, recording.video, info, what=f"depth maps (*{suffix})")
-            paths = tuple(files.get(frame) for frame in _frame_numbers(recording))
+            paths = tuple(files.get(frame) for frame in _frame_numbers(recording, float(info.fps)))
             return replace(recording, depth=DepthFiles(paths=paths, unit_m=unit_m))
     raise InputError(
         f"{quote_path(target)} has no depth maps: they are named 000000.png (16 bits, millimeters) "
@@ -104,11 +104,10 @@ def _with_depth(recording: Recording, folder: Path) -> Recording:
     )
 
 
-def _frame_numbers(recording: Recording) -> list[int]:
+def _frame_numbers(recording: Recording, fps: float) -> list[int]:
     """Return the number in the video of each frame of a recording, from 0 at its constant rate."""
     if recording.times_s is None:
         return list(range(recording.start, recording.start + recording.frames))
-    fps = float(probe_video(recording.video).fps)
     return np.floor(recording.times_s * fps + 0.5 + 1e-6).astype(int).tolist()
 
 

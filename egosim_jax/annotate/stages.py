@@ -352,10 +352,15 @@ def joints_in_world(record: Record) -> np.ndarray:
 
 def _joints_in_cameras(record: Record) -> np.ndarray:
     """Return the joints in meters in the camera of each frame: recorded, or lifted from pixels."""
+    given = record.recording.joints_m
+    if given is None:
+        return lifted_hands(record)
+    poses = rearrange(invert(record.cameras.world_from_camera), "f a b -> f 1 a b")
+    return transform(poses, given[record.source_frames].astype(float))
+
+
+def lifted_hands(record: Record) -> np.ndarray:
+    """Return the detected hands in meters, in the camera of each frame."""
     from egosim_jax.perception.video.hands import lift, steady
 
-    given, cameras = record.recording.joints_m, record.cameras
-    if given is not None:
-        poses = rearrange(invert(cameras.world_from_camera), "f a b -> f 1 a b")
-        return transform(poses, given[record.source_frames].astype(float))
-    return steady(lift(record.require("hands"), cameras.intrinsics_px), record.fps)
+    return steady(lift(record.require("hands"), record.cameras.intrinsics_px), record.fps)

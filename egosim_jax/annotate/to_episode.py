@@ -55,21 +55,12 @@ def episode_from(
     moments = Timeline.even(len(recorded.frames), recorded.fps).at_rate(video.fps)
     if every_frame:
         moments = np.arange(len(recorded.frames))
-    step = video.frames - 1
-    possible = (len(moments) - 1) // step
-    count = possible if clips is None else clips
-    if not 0 < count <= possible:
-        raise InputError(
-            f"{quote_path(folder)} has {len(moments)} frames at {video.fps} fps, enough for "
-            f"{possible} clips of {video.frames} frames, not {count}. (--clips, --config)"
-        )
-    picked = [moments[number * step : number * step + video.frames] for number in range(count)]
+    picked = pick_clips(moments, video, clips, name=quote_path(folder))
     image = read_image(folder / "first_frame.png")
     crop = crop_to(video, recorded.frames.shape[1:3], name=quote_path(folder))
     frames = [np.stack([crop.resample(frame) for frame in recorded.frames[k]]) for k in picked]
     cameras = crop.intrinsics(arrays["intrinsics_px"])
-    kinds: dict[int, Kind] = {joints: kind for kind, joints in JOINTS.items()}
-    kind = kinds[arrays["joints_m"].shape[2]]
+    kind = kind_of(arrays["joints_m"])
     return Episode(
         state=snapshot.load(folder / "state"),
         actions=tuple(
@@ -90,6 +81,26 @@ def episode_from(
         first_frame=crop.resample(image),
         ground_truth=tuple(GroundTruth(frames=target) for target in frames),
     )
+
+
+def pick_clips(
+    moments: np.ndarray, video: VideoSpec, clips: int | None, *, name: str
+) -> list[np.ndarray]:
+    """Return the frames of each clip, by default of all; each begins with the last one's end."""
+    step = video.frames - 1
+    possible = (len(moments) - 1) // step
+    count = possible if clips is None else clips
+    if not 0 < count <= possible:
+        raise InputError(
+            f"{name} has {len(moments)} frames at {video.fps} fps, enough for {possible} clips of "
+            f"{video.frames} frames, not {count}. (--clips, --config)"
+        )
+    return [moments[number * step : number * step + video.frames] for number in range(count)]
+
+
+def kind_of(joints_m: np.ndarray) -> Kind:
+    """Return the kind of hands by their number of joints."""
+    return next(kind for kind, count in JOINTS.items() if count == joints_m.shape[2])
 
 
 def crop_to(video: VideoSpec, size: tuple[int, ...], *, name: str) -> Crop:

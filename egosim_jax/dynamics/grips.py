@@ -19,6 +19,7 @@ from jaxtyping import Float
 from egosim_jax.dynamics.hands import HandTrack
 from egosim_jax.dynamics.solids import Solid
 from egosim_jax.geometry import hinge_rotation, transform
+from egosim_jax.types.arrays import Matrix, Points, Pose, Poses, Vector
 
 STEADY_M = 0.0015
 """Maximum change of an exact hand's opening during a hold, in meters."""
@@ -132,7 +133,7 @@ def possible_holds(track: HandTrack) -> list[Hold]:
     ]
 
 
-def closes_on(track: HandTrack, solid: Solid, pose: Float[np.ndarray, "4 4"]) -> bool:
+def closes_on(track: HandTrack, solid: Solid, pose: Pose) -> bool:
     """Return True if a hand closes around a solid until the last frame: it has not held it yet."""
     opening, tips = track.opening_m, track.tips_m[-1]
     if not track.present[-1] or opening[-1] > opening.min():
@@ -166,9 +167,7 @@ def _last_steady(track: HandTrack, begin: int) -> int:
     return frames - 1
 
 
-def contact_of(
-    solid: Solid, pose: Float[np.ndarray, "4 4"], track: HandTrack, hold: Hold
-) -> Contact | None:
+def contact_of(solid: Solid, pose: Pose, track: HandTrack, hold: Hold) -> Contact | None:
     """Return the contact of the fingers around a solid in a hold; None if they do not grip it.
 
     A hand may close and begin to carry between two frames. So the pinch point of the frame before
@@ -190,9 +189,7 @@ def contact_of(
     return None
 
 
-def _pinch_points(
-    track: HandTrack, hold: Hold, pinch_m: Float[np.ndarray, " 3"]
-) -> list[Float[np.ndarray, " 3"]]:
+def _pinch_points(track: HandTrack, hold: Hold, pinch_m: Vector) -> list[Vector]:
     """Return the places where the object may have begun to move, the most probable first."""
     if track.sigma_m or not 0 < hold.begin < hold.end:
         return [pinch_m]
@@ -216,9 +213,7 @@ def is_grip(contact: Contact, track: HandTrack, hold: Hold) -> bool:
     return contact.gap_m <= FIT_M and np.linalg.norm(way, axis=1).max() >= TRAVEL_M
 
 
-def hand_motion(
-    track: HandTrack, hold: Hold, first_m: Float[np.ndarray, " 3"], up: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, "f 4 4"]:
+def hand_motion(track: HandTrack, hold: Hold, first_m: Vector, up: Vector) -> Poses:
     """Return the rigid motion of a hand since the beginning of a hold, constant after its end.
 
     `first_m` is the pinch point at the beginning (`Contact`). A noisy hand only turns about the
@@ -238,7 +233,7 @@ def hand_motion(
 
 
 def _without_small_tilt(
-    turn: Float[np.ndarray, "f 3 3"], sigma_m: float, up: Float[np.ndarray, " 3"]
+    turn: Float[np.ndarray, "f 3 3"], sigma_m: float, up: Vector
 ) -> Float[np.ndarray, "f 3 3"]:
     """Return rotations without a tilt that the noise of a hand explains."""
     tilt = np.degrees(np.arccos(np.clip(np.einsum("i,fij,j->f", up, turn, up), -1, 1)))
@@ -248,9 +243,7 @@ def _without_small_tilt(
     return np.stack([twist(matrix, up) for matrix in turn])
 
 
-def twist(
-    rotation: Float[np.ndarray, "3 3"], axis: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, "3 3"]:
+def twist(rotation: Matrix, axis: Vector) -> Matrix:
     """Return the component of a rotation about an axis (swing-twist decomposition)."""
     import cv2
 
@@ -260,7 +253,7 @@ def twist(
     return cv2.Rodrigues(2 * np.arctan2(along, np.cos(half)) * axis)[0]
 
 
-def hinge_motion(track: HandTrack, hold: Hold) -> Float[np.ndarray, "f 4 4"] | None:
+def hinge_motion(track: HandTrack, hold: Hold) -> Poses | None:
     """Return the motion of an object on a hinge; None unless the pinch point describes an arc.
 
     The motion is constant before and after the hold.
@@ -285,7 +278,7 @@ def hinge_motion(track: HandTrack, hold: Hold) -> Float[np.ndarray, "f 4 4"] | N
     return motion[np.clip(np.arange(len(track.present)), hold.begin, hold.end) - hold.begin]
 
 
-def is_along_edge(points_m: Float[np.ndarray, "n 3"], hinged: Float[np.ndarray, "4 4"]) -> bool:
+def is_along_edge(points_m: Points, hinged: Pose) -> bool:
     """Return True if the axis of a hinge's motion passes along an object that has these points.
 
     A point of a motion by an angle a, at a distance r from the axis, moves by 2 r sin(a / 2).

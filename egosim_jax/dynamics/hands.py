@@ -34,6 +34,7 @@ MAX_GAP = 4
 class HandTrack:
     """One hand in every frame of a clip."""
 
+    kind: Kind
     joints_m: Float[np.ndarray, "f j 3"]
     """Joints; interpolated where the hand is missing."""
     present: Bool[np.ndarray, " f"]
@@ -81,6 +82,7 @@ def track_hand(joints_m: Float[np.ndarray, "f j 3"], kind: Kind) -> HandTrack | 
     else:
         sigma = 0.0
     return HandTrack(
+        kind=kind,
         joints_m=complete,
         present=_present(seen, len(joints_m)),
         tips_m=grasping_tips(complete, kind),

@@ -15,6 +15,7 @@ from egosim_jax.geometry import invert, level_axes, transform
 from egosim_jax.state.new_objects import is_among
 from egosim_jax.state.planes import main_support, vertical
 from egosim_jax.types import SceneState
+from egosim_jax.types.arrays import Plane, Points, Pose, Poses
 
 MIN_POINTS = 30
 """Minimum number of points of an object that moves."""
@@ -37,19 +38,19 @@ class LevelScene:
     ground_m: Float[np.ndarray, "n 3"]
     """The same points in level coordinates."""
 
-    def plane(self, number: int) -> Float[np.ndarray, " 4"]:
+    def plane(self, number: int) -> Plane:
         """Return the plane in the world under an object; its unit normal points up."""
         solid = self.solids.get(number)
         height = solid.base_m - solid.lifted_m if solid else 0.0
         return np.array([0, 0, 1, -height]) @ self.level_from_world
 
-    def with_object(self, number: int, points_m: Float[np.ndarray, "n 3"]) -> LevelScene:
+    def with_object(self, number: int, points_m: Points) -> LevelScene:
         """Return the scene with one more object, of points of the background in the world."""
         rest = ~is_among(self.background_m, points_m.astype(np.float32))
         scene = replace(self, background_m=self.background_m[rest], ground_m=self.ground_m[rest])
         return scene.with_solid(number, transform(self.level_from_world, points_m))
 
-    def with_solid(self, number: int, points_m: Float[np.ndarray, "n 3"]) -> LevelScene:
+    def with_solid(self, number: int, points_m: Points) -> LevelScene:
         """Return the scene with one more object, of points in level coordinates."""
         base = _base(points_m, self.solids, self.ground_m)
         solid = make_solid(number, points_m, base_m=base, eye_m=self.eye_m)
@@ -58,7 +59,7 @@ class LevelScene:
 
 def level_scene(
     state: SceneState,
-    world_from_camera: Float[np.ndarray, "4 4"],
+    world_from_camera: Pose,
     reached_m: Float[np.ndarray, "p 3"],
     *,
     reach_m: float,
@@ -98,14 +99,12 @@ def level_scene(
     return replace(scene, solids=solids)
 
 
-def _low(points_m: Float[np.ndarray, "n 3"]) -> float:
+def _low(points_m: Points) -> float:
     return float(np.quantile(points_m[:, 2], BASE_SHARE))
 
 
 def _base(
-    points_m: Float[np.ndarray, "n 3"],
-    below: Mapping[int, Solid],
-    background_m: Float[np.ndarray, "m 3"],
+    points_m: Points, below: Mapping[int, Solid], background_m: Float[np.ndarray, "m 3"]
 ) -> float:
     """Return the height of an object's support: the table's, or the top of a lower object's.
 
@@ -131,9 +130,7 @@ def _base(
     return 0.0 if low_m < max(NEAR_SUPPORT_M, np.ptp(points_m[:, 2])) else low_m
 
 
-def _level(
-    state: SceneState, world_from_camera: Float[np.ndarray, "4 4"]
-) -> Float[np.ndarray, "4 4"]:
+def _level(state: SceneState, world_from_camera: Pose) -> Pose:
     """Return the transform to level coordinates, by the plane that most background points are on.
 
     Without a plane, z is up and 0 is the height of the lowest point.
@@ -147,6 +144,6 @@ def _level(
     return level
 
 
-def to_world(scene: LevelScene, motion: Float[np.ndarray, "f 4 4"]) -> Float[np.ndarray, "f 4 4"]:
+def to_world(scene: LevelScene, motion: Poses) -> Poses:
     """Return a motion in level coordinates as a motion in the world."""
     return invert(scene.level_from_world) @ motion @ scene.level_from_world

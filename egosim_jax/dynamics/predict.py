@@ -12,7 +12,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
 
 from egosim_jax.dynamics.grips import (
     Contact,
@@ -34,6 +33,7 @@ from egosim_jax.dynamics.support import UP, carry_riders, fall, furniture, next_
 from egosim_jax.dynamics.walk import Grip, Walk
 from egosim_jax.geometry import rotation_angles_deg, transform
 from egosim_jax.types import Action, SceneState
+from egosim_jax.types.arrays import Points, Pose, Poses, Vector
 from egosim_jax.types.motion import Cause, How, Motion, ObjectPath
 
 REACH_M = 0.25
@@ -85,7 +85,7 @@ class Prediction:
             fps=fps,
         )
 
-    def with_object(self, number: int, points_m: Float[np.ndarray, "n 3"]) -> Prediction:
+    def with_object(self, number: int, points_m: Points) -> Prediction:
         """Return the prediction with one more object, which has no id in the state."""
         return replace(self, scene=self.scene.with_object(number, points_m))
 
@@ -235,12 +235,8 @@ def _grasp(walk: Walk) -> None:
 
 
 def _coupling(
-    track: HandTrack,
-    hold: Hold,
-    pinch_m: Float[np.ndarray, " 3"],
-    solid: Solid,
-    start: Float[np.ndarray, "4 4"],
-) -> tuple[Float[np.ndarray, "f 4 4"], How]:
+    track: HandTrack, hold: Hold, pinch_m: Vector, solid: Solid, start: Pose
+) -> tuple[Poses, How]:
     """Return the motion of an object in a hand, about a hinge if the hand describes its arc."""
     motion = hinge_motion(track, hold)
     if motion is not None and is_along_edge(transform(start, solid.points_m), motion[-1]):

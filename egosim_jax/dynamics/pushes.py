@@ -25,6 +25,7 @@ from egosim_jax.dynamics.walk import Walk
 from egosim_jax.geometry import rotation_z, transform
 from egosim_jax.rendering.skeleton import SKELETONS
 from egosim_jax.types import Kind
+from egosim_jax.types.arrays import Pose, Vector
 
 FLESH_M: dict[Kind, float] = {"human": 0.008, "robot": 0.006}
 """Radius of flesh around joints and bones, in meters."""
@@ -72,11 +73,7 @@ def push(walk: Walk) -> None:
 
 def _flesh_m(track: HandTrack) -> float:
     """Return the radius of a hand's flesh; a noisy hand must be surely inside an object."""
-    return FLESH_M[_kind(track)] - 2 * track.sigma_m
-
-
-def _kind(track: HandTrack) -> Kind:
-    return "human" if track.joints_m.shape[1] == len(SKELETONS["human"].colors) else "robot"
+    return FLESH_M[track.kind] - 2 * track.sigma_m
 
 
 @cache
@@ -87,12 +84,8 @@ def _touching(kind: Kind) -> Float[np.ndarray, "p j"]:
         back = joints[0] - joints[1:].mean(axis=0)
         between = [tip + share * back for tip in joints[1:] for share in JAW_SHARES]
     else:
-        between = [joints[list(bone)].mean(axis=0) for bone in _bones(kind)]
+        between = [joints[bone].mean(axis=0) for bone in SKELETONS[kind].bones]
     return np.concatenate([joints, between])
-
-
-def _bones(kind: Kind) -> list[tuple[int, int]]:
-    return [(int(first), int(last)) for first, last in SKELETONS[kind].bones]
 
 
 @cache
@@ -105,7 +98,7 @@ def _fingers(kind: Kind) -> Bool[np.ndarray, " p"]:
 def _appear(walk: Walk, hand: int, joints_m: Float[np.ndarray, "j 3"]) -> None:
     """Note the points that are inside objects when a hand appears."""
     track = walk.tracks[hand]
-    points = _touching(_kind(track)) @ joints_m
+    points = _touching(track.kind) @ joints_m
     for number, solid in walk.solids.items():
         inside = solid.distance(points, walk.poses[number]) < _flesh_m(track)
         walk.pressing |= {(hand, int(point), number) for point in np.flatnonzero(inside)}
@@ -138,7 +131,7 @@ def _push_one(
 ) -> None:
     """Push an object out of the flesh of a hand that enters it from the side."""
     solid, track, pose = walk.solids[number], walk.tracks[hand], walk.poses[number]
-    weights, flesh = _touching(_kind(track)), _flesh_m(track)
+    weights, flesh = _touching(track.kind), _flesh_m(track)
     points = weights @ joints_m
     distances = solid.distance(points, pose)
     inside = distances < flesh
@@ -186,15 +179,12 @@ def _yields(
     falls = -way_m[:, 2] > DESCENT * np.linalg.norm(way_m[:, :2], axis=1)
     first, second = (solid.normal(tip, pose)[1] @ opening / size for tip in (thumb, fingers))
     around = first < -FACING and second > FACING
-    return falls | _fingers(_kind(track)) if around else falls
+    return falls | _fingers(track.kind) if around else falls
 
 
 def push_out(
-    solid: Solid,
-    pose: Float[np.ndarray, "4 4"],
-    points_m: Float[np.ndarray, "p 3"],
-    flesh_m: float,
-) -> tuple[Float[np.ndarray, "4 4"] | None, Bool[np.ndarray, " p"]]:
+    solid: Solid, pose: Pose, points_m: Float[np.ndarray, "p 3"], flesh_m: float
+) -> tuple[Pose | None, Bool[np.ndarray, " p"]]:
     """Return the motion of a solid out of the flesh around points, the deepest one first.
 
     Also returns which points press instead, because they are above or below it. A push may turn the
@@ -217,13 +207,7 @@ def push_out(
     return motion, pressing
 
 
-def _slide(
-    solid: Solid,
-    pose: Float[np.ndarray, "4 4"],
-    point_m: Float[np.ndarray, " 3"],
-    normal: Float[np.ndarray, " 3"],
-    depth_m: float,
-) -> Float[np.ndarray, "4 4"]:
+def _slide(solid: Solid, pose: Pose, point_m: Vector, normal: Vector, depth_m: float) -> Pose:
     """Return the motion of a solid by the depth of a point in it; the normal is not vertical."""
     level = float(np.hypot(normal[0], normal[1]))
     force = -np.array([normal[0], normal[1], 0.0]) / level

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from egosim_jax.geometry import invert, transform
+from egosim_jax.types.arrays import Plane, Points, Pose, Vector
 
 if TYPE_CHECKING:
     from scipy.spatial import ConvexHull
@@ -51,7 +52,7 @@ class Solid:
     """Height of an object in a hand above the place where it last rested."""
 
     @cached_property
-    def center_m(self) -> Float[np.ndarray, " 3"]:
+    def center_m(self) -> Vector:
         """Middle of the box around the hull."""
         return (self.corners_m.min(axis=0) + self.corners_m.max(axis=0)) / 2
 
@@ -66,7 +67,7 @@ class Solid:
         flat = self.corners_m[:, :2] - self.center_m[:2]
         return 0.6 * float(np.linalg.norm(flat, axis=1).mean())
 
-    def lifted(self, pose: Float[np.ndarray, "4 4"]) -> Solid:
+    def lifted(self, pose: Pose) -> Solid:
         """Return the solid of an object in a hand that rested before it was moved to a pose."""
         normals = self.faces[:, :3] @ pose[:3, :3].T
         corners = transform(pose, self.corners_m)
@@ -79,9 +80,7 @@ class Solid:
             lifted_m=float((transform(pose, self.center_m[None])[0] - self.center_m)[2]),
         )
 
-    def distance(
-        self, points_m: Float[np.ndarray, "p 3"], pose: Float[np.ndarray, "4 4"]
-    ) -> Float[np.ndarray, " p"]:
+    def distance(self, points_m: Float[np.ndarray, "p 3"], pose: Pose) -> Float[np.ndarray, " p"]:
         """Return signed distances in meters from the hull, moved by a pose; negative inside.
 
         Outside of an edge they are too small.
@@ -89,32 +88,24 @@ class Solid:
         local = transform(invert(pose), points_m)
         return (local @ self.faces[:, :3].T + self.faces[:, 3]).max(axis=1)
 
-    def normal(
-        self, point_m: Float[np.ndarray, " 3"], pose: Float[np.ndarray, "4 4"]
-    ) -> tuple[float, Float[np.ndarray, " 3"]]:
+    def normal(self, point_m: Vector, pose: Pose) -> tuple[float, Vector]:
         """Return the signed distance of a point, and the outward normal of the nearest face."""
         local = transform(invert(pose), point_m[None])[0]
         distances = self.faces[:, :3] @ local + self.faces[:, 3]
         nearest = int(distances.argmax())
         return float(distances[nearest]), pose[:3, :3] @ self.faces[nearest, :3]
 
-    def is_open_at(self, point_m: Float[np.ndarray, " 3"], pose: Float[np.ndarray, "4 4"]) -> bool:
+    def is_open_at(self, point_m: Vector, pose: Pose) -> bool:
         """Return True if no visible point is above or below a point: it is in a ring's hole."""
         local = transform(invert(pose), point_m[None])[0]
         return bool(np.linalg.norm((self.points_m - local)[:, :2], axis=1).min() > HOLE_M)
 
-    def width_along(self, way: Float[np.ndarray, " 3"], pose: Float[np.ndarray, "4 4"]) -> float:
+    def width_along(self, way: Vector, pose: Pose) -> float:
         """Return the extent of the hull along a unit vector, in meters."""
         return float(np.ptp(self.corners_m @ (pose[:3, :3].T @ way)))
 
 
-def make_solid(
-    number: int,
-    points_m: Float[np.ndarray, "n 3"],
-    *,
-    base_m: float,
-    eye_m: Float[np.ndarray, " 3"],
-) -> Solid | None:
+def make_solid(number: int, points_m: Points, *, base_m: float, eye_m: Vector) -> Solid | None:
     """Return the solid of an object's points; None if they span no volume.
 
     `eye_m` is the camera that saw them.
@@ -133,9 +124,7 @@ def make_solid(
     )
 
 
-def hull_on_plane(
-    points_m: Float[np.ndarray, "n 3"], plane: Float[np.ndarray, " 4"]
-) -> ConvexHull | None:
+def hull_on_plane(points_m: Points, plane: Plane) -> ConvexHull | None:
     """Return the hull of points and of their feet on a plane; None if they span no volume.
 
     A camera above an object sees no point of its underside.
@@ -150,9 +139,7 @@ def hull_on_plane(
         return None
 
 
-def _hidden_side(
-    points_m: Float[np.ndarray, "n 3"], eye_m: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, "k 3"]:
+def _hidden_side(points_m: Points, eye_m: Vector) -> Float[np.ndarray, "k 3"]:
     """Return points of the back of an object that has no flat top; none for a flat top.
 
     The front, rotated by half a turn about the vertical, is the back, as far away as makes the

@@ -13,6 +13,7 @@ from egosim_jax.dynamics.grips import twist
 from egosim_jax.dynamics.solids import Solid
 from egosim_jax.dynamics.walk import SAME_POSE, Fall, Walk
 from egosim_jax.geometry import transform
+from egosim_jax.types.arrays import Pose
 
 TOUCH_M = 0.010
 """Maximum vertical distance of an object from what it stands on, in meters."""
@@ -43,7 +44,7 @@ UP = np.array([0.0, 0.0, 1.0])
 class Body:
     """A solid at a pose: heights, and its outline from above."""
 
-    def __init__(self, solid: Solid, pose: Float[np.ndarray, "4 4"]):
+    def __init__(self, solid: Solid, pose: Pose):
         """Move the corners of a solid."""
         self.solid = solid
         self.corners_m = transform(pose, solid.corners_m)
@@ -99,7 +100,7 @@ def _is_above(top: Body, carrier: Body) -> bool:
     return not far and is_inside(carrier.outline_m, top.center_m[:2])
 
 
-def carry_riders(walk: Walk, number: int, pose: Float[np.ndarray, "4 4"], hand: int | None) -> None:
+def carry_riders(walk: Walk, number: int, pose: Pose, hand: int | None) -> None:
     """Move the objects on an object, directly or on others, as it moves to a pose."""
     change = pose @ np.linalg.inv(walk.poses[number])
     if np.abs(change - np.eye(4)).max() < SAME_POSE:
@@ -144,7 +145,7 @@ def next_to(walk: Walk, number: int) -> list[int]:
     ]
 
 
-def raised(walk: Walk, number: int, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+def raised(walk: Walk, number: int, pose: Pose) -> Pose:
     """Return a pose above the main support: an object that is pressed down slips in its hand."""
     solid = walk.solids[number]
     low = float(transform(pose, solid.corners_m)[:, 2].min())

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from egosim_jax.dynamics.grips import Hold
 from egosim_jax.dynamics.hands import HandTrack
 from egosim_jax.dynamics.solids import Solid
+from egosim_jax.types.arrays import Pose
 from egosim_jax.types.motion import Cause, How
 
 SAME_POSE = 1e-6
@@ -90,11 +91,11 @@ class Walk:
         """Ids of the objects in hands."""
         return {grip.number for grip in self.grips.values()}
 
-    def before(self, number: int) -> Float[np.ndarray, "4 4"]:
+    def before(self, number: int) -> Pose:
         """Return the pose of an object in the last frame."""
         return self.paths[number][-1]
 
-    def move(self, number: int, pose: Float[np.ndarray, "4 4"], how: How, hand: int | None) -> None:
+    def move(self, number: int, pose: Pose, how: How, hand: int | None) -> None:
         """Move an object to a pose, and note the cause."""
         if np.abs(pose - self.poses[number]).max() > SAME_POSE:
             self.note(number, how, hand, self.frame - 1, self.frame)

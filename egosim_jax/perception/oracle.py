@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from egosim_jax.geometry import invert
 from egosim_jax.perception.pipeline import Observation, Pipeline, find_interactions
 from egosim_jax.perception.registry import register
 from egosim_jax.types import Action, Clip, InputError, SceneState
+from egosim_jax.types.arrays import Poses
 
 
 @register("oracle")
@@ -48,9 +48,7 @@ class ReadGroundTruth:
         return self.ground_truth[state.step]
 
 
-def motions_of(
-    world_from_body: Mapping[int, Float[np.ndarray, "f 4 4"]],
-) -> dict[int, Float[np.ndarray, "f 4 4"]]:
+def motions_of(world_from_body: Mapping[int, Poses]) -> dict[int, Poses]:
     """Return the motion of each moving body, relative to the first frame.
 
     The result does not depend on the choice of the body's axes.

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Float
 
 from egosim_jax.io.bounded import open_regular, quote, quote_text, read_bytes
 from egosim_jax.io.digest import sha256
@@ -31,6 +31,7 @@ from egosim_jax.perception.registry import register
 from egosim_jax.state.align import CameraMethod, align_cameras
 from egosim_jax.state.filter import is_hand
 from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState
+from egosim_jax.types.arrays import DepthMaps, IdMaps
 
 IDS_PER_STEP = 1000
 """Offset between the object ids of successive steps, since recorded ids repeat in each clip."""
@@ -130,14 +131,12 @@ class ReadRecording:
         )
         return cameras, scale
 
-    def _depth(self, clip: Clip, scale: float, step: int) -> Float32[np.ndarray, "f h w"]:
+    def _depth(self, clip: Clip, scale: float, step: int) -> DepthMaps:
         """Return the recorded depth in meters of the world; infinite where it is 0 or NaN."""
         depth = scale * self._images("depth", step, clip)
         return np.where(depth > 0, depth, np.inf).astype(np.float32)
 
-    def _object_ids(
-        self, clip: Clip, phrases: Mapping[int, str], step: int
-    ) -> Int32[np.ndarray, "f h w"]:
+    def _object_ids(self, clip: Clip, phrases: Mapping[int, str], step: int) -> IdMaps:
         """Return the recorded object ids in the state's numbering; hands and arms are negative."""
         recorded = self._images("mask", step, clip).astype(np.int32)
         ids = np.where(recorded > 0, recorded + IDS_PER_STEP * step, 0)

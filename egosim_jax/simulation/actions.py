@@ -57,12 +57,7 @@ MAX_CHANGE = 0.05
 
 
 def check_action(
-    action: Action,
-    *,
-    state: SceneState,
-    fps: int,
-    continued: bool = False,
-    any_hand: bool = False,
+    action: Action, *, state: SceneState, fps: int, continued: bool = False, any_hand: bool = False
 ) -> None:
     """Raise `InputError` for a camera that is too fast, a wrong joint order, or an unseen scene.
 

@@ -9,12 +9,12 @@ from io import BytesIO
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
 from PIL import Image
 
 from egosim_jax.rendering.portrait import portrait
 from egosim_jax.state.planes import vertical
 from egosim_jax.types import Clip, SceneState
+from egosim_jax.types.arrays import Video
 
 MAX_FRAMES = 65
 """Number of a video's frames that are shown; a page with more would be slow."""
@@ -36,7 +36,7 @@ def _image_of(value: Clip | SceneState) -> str:
     return _image(np.concatenate(list(portrait(value, up=vertical(value))), axis=1)[None], fps=1)
 
 
-def _image(frames: UInt8[np.ndarray, "f h w 3"], *, fps: int) -> str:
+def _image(frames: Video, *, fps: int) -> str:
     """Return a WebP image, which repeats if it has several frames."""
     first, *others = map(Image.fromarray, frames)
     file = BytesIO()

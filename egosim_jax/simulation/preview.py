@@ -22,6 +22,7 @@ from egosim_jax.rendering.hand_mesh import pose_hands
 from egosim_jax.rendering.mesh import MovingMesh, Side
 from egosim_jax.rendering.skeleton import NEAR_M
 from egosim_jax.types import Action, Cameras, VideoSpec, View
+from egosim_jax.types.arrays import DepthMaps, RgbImage, Video
 
 NAME = "preview"
 """Name of the preview where a model is named."""
@@ -58,7 +59,7 @@ class Preview:
     prior: ClassVar[PriorKind] = "predicted"
 
     def stream(
-        self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
+        self, view: View, action: Action, first_frame: RgbImage, seed: int
     ) -> Iterator[UInt8[np.ndarray, "g h w 3"]]:
         """Yield the frames of a clip of any length and size, in groups."""
         mesh = mesh_of(action)
@@ -70,14 +71,12 @@ class Preview:
             cameras = replace(action.cameras, world_from_camera=poses)
             yield draw(View(**group), replace(mesh, vertices_m=vertices), cameras)
 
-    def __call__(
-        self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
-    ) -> UInt8[np.ndarray, "f h w 3"]:
+    def __call__(self, view: View, action: Action, first_frame: RgbImage, seed: int) -> Video:
         """Return the frames of a clip of any length and size."""
         return np.concatenate(list(self.stream(view, action, first_frame, seed)))
 
 
-def draw(view: View, hands: MovingMesh, cameras: Cameras) -> UInt8[np.ndarray, "f h w 3"]:
+def draw(view: View, hands: MovingMesh, cameras: Cameras) -> Video:
     """Return a view without holes, with shaded hands where no point of it is nearer."""
     frames = np.stack([fill_holes(*images) for images in zip(*_seen(view), strict=True)])
     rows, columns = _window(hands, cameras)
@@ -124,9 +123,7 @@ def _seen(view: View) -> tuple[np.ndarray, np.ndarray]:
     return view.frames, np.where(np.isfinite(view.depth_m), weight, np.float32(0))
 
 
-def fill_holes(
-    image: UInt8[np.ndarray, "h w 3"], weight: Float32[np.ndarray, "h w"]
-) -> UInt8[np.ndarray, "h w 3"]:
+def fill_holes(image: RgbImage, weight: Float32[np.ndarray, "h w"]) -> RgbImage:
     """Return an image whose pixels of weight 0 have the colors around them.
 
     A hole takes the weighted mean of an image pyramid's finest level with enough weight there.
@@ -155,9 +152,7 @@ def _push_pull(
     return np.where((weight >= MIN_WEIGHT)[..., None], colors, rest)
 
 
-def _light(
-    hands: MovingMesh, cameras: Cameras, depth_m: Float32[np.ndarray, "f h w"]
-) -> Float32[np.ndarray, "f h w"]:
+def _light(hands: MovingMesh, cameras: Cameras, depth_m: DepthMaps) -> DepthMaps:
     """Return the share of light on the surfaces near hands: a soft shadow of contact."""
     import cv2
     from scipy.spatial import KDTree

@@ -8,32 +8,25 @@ folder/clip_N/state/            state after the step
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sized
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
 
 from egosim_jax.io.atomic import atomic_write, lock_folder
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.journal import Journal
 from egosim_jax.io.untrusted.npz import read_arrays
 from egosim_jax.perception import archive
-from egosim_jax.rendering import POINT_PX, PriorKind, Renderer, reference
 from egosim_jax.runtime.phases import phase
 from egosim_jax.runtime.terminal import counted
 from egosim_jax.simulation.simulator import Made, Phase, Simulator, Step
-from egosim_jax.simulation.streams import (
-    ClipStream,
-    KeptStream,
-    Latency,
-    VideoGenerator,
-    chunk_frames,
-)
+from egosim_jax.simulation.streams import Latency
 from egosim_jax.state import snapshot
-from egosim_jax.types import Action, Clip, SceneState, View, check_seed
+from egosim_jax.types import Action, Clip, SceneState, check_seed
+from egosim_jax.types.arrays import RgbImage, Video
 
 OUTPUTS = ("clip_*/*",)
 """Globs of files that only a journaled simulation writes."""
@@ -53,14 +46,16 @@ class Rollout:
         actions: Iterable[Action],
         *,
         seed: int,
-        first_frame: UInt8[np.ndarray, "h w 3"] | None = None,
+        first_frame: RgbImage | None = None,
+        frames: Video | None = None,
     ) -> Iterator[Step]:
         """Run one step per action, each from the state after the previous one.
 
         The same call resumes an interrupted run, and yields its finished steps first. `first_frame`
-        is the first frame of the first clip. Step N uses `seed + N`, which must be a valid seed
-        too. Raises `InputError` showing both values if the folder holds a run of another state,
-        action, generator, renderer, perception or seed, and if another process writes to it.
+        is the first frame of the first clip, and `frames` are all of its frames, if it is made
+        already. Step N uses `seed + N`, which must be a valid seed too. Raises `InputError` showing
+        both values if the folder holds a run of another state, action, generator, renderer,
+        perception or seed, and if another process writes to it.
         """
         check_seed(seed, name="seed")
         if isinstance(actions, Sized):  # fail before the first clip, not after hours
@@ -74,14 +69,12 @@ class Rollout:
             for number, action in enumerate(actions, start=1):
                 check_seed(seed + number, name="seed + number of actions")
                 journal.require(f"{number} action", {"action": fingerprint(action)})
-                image = first_frame if number == 1 else None
-                step = self._step(journal, number, state, action, seed + number, image)
+                given = {"first_frame": first_frame, "frames": frames} if number == 1 else {}
+                step = self._step(journal, number, state, action, seed + number, given)
                 yield step
                 state = step.state
 
-    def _inputs(
-        self, state: SceneState, seed: int, first_frame: UInt8[np.ndarray, "h w 3"] | None
-    ) -> dict[str, str]:
+    def _inputs(self, state: SceneState, seed: int, first_frame: RgbImage | None) -> dict[str, str]:
         simulator = self.simulator
         return {
             "state": snapshot.fingerprint(state),
@@ -103,9 +96,9 @@ class Rollout:
         state: SceneState,
         action: Action,
         seed: int,
-        first_frame: UInt8[np.ndarray, "h w 3"] | None,
+        given: Mapping[str, Any],
     ) -> Step:
-        """Run `Simulator.step` with each phase journaled."""
+        """Run `Simulator.step` with each phase journaled; `given` are its further arguments."""
         folder, clip = self.folder / f"clip_{number}", self._name.format(number=number)
 
         def load_made(path: Path) -> Made:
@@ -139,52 +132,7 @@ class Rollout:
             key = f"{number} {name}"
             return journal.phase(key, path, make=made, save=save, load=load, about=about)
 
-        return self.simulator.step(state, action, seed=seed, first_frame=first_frame, run=run)
-
-
-@dataclass(frozen=True, kw_only=True)
-class RecordedClip:
-    """Generator of a clip that is known, in the chunks in which it was made."""
-
-    generator: VideoGenerator
-    """Generator that made the clip."""
-    frames: UInt8[np.ndarray, "f h w 3"]
-    """Frames of the clip."""
-
-    @property
-    def renderer(self) -> Renderer:
-        """Renderer of the generator."""
-        return getattr(self.generator, "renderer", reference)
-
-    @property
-    def point_px(self) -> int:
-        """Side of a point of the view in pixels."""
-        return getattr(self.generator, "point_px", POINT_PX)
-
-    @property
-    def prior(self) -> PriorKind:
-        """Objects in the view."""
-        return getattr(self.generator, "prior", "static")
-
-    @property
-    def chunk_frames(self) -> tuple[int, ...]:
-        """Frames of each chunk."""
-        return chunk_frames(self.generator) or (len(self.frames),)
-
-    def fingerprint(self) -> str:
-        """Return the content hash of the generator: the clip is its own."""
-        return fingerprint(self.generator)
-
-    def begin(self, first_frame: UInt8[np.ndarray, "h w 3"], seed: int) -> ClipStream:
-        """Begin the clip."""
-        ends = np.cumsum(self.chunk_frames)[:-1]
-        return KeptStream(iter(np.split(self.frames, ends)))
-
-    def __call__(
-        self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
-    ) -> UInt8[np.ndarray, "f h w 3"]:
-        """Return the frames."""
-        return self.frames
+        return self.simulator.step(state, action, seed=seed, run=run, **given)
 
 
 def _save_frames(path: Path, made: Made) -> None:

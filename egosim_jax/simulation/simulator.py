@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import reduce
-from typing import Any, Literal, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any, Literal, cast
 
 import numpy as np
 from jaxtyping import UInt8
@@ -48,11 +48,13 @@ from egosim_jax.types import (
     Shown,
     View,
 )
+from egosim_jax.types.arrays import RgbImage, Video
 
 Phase = Literal["predict", "render", "generate", "perceive", "fuse"]
 """Name of a phase of a clip."""
+Run = Callable[[Phase, Callable[[], Any]], Any]
+"""Function that runs a phase of a clip, or returns the result that it kept of it."""
 UpdateEvery = Literal["clip", "chunk"]
-T = TypeVar("T")
 BY_STEP = ("oracle", "recorded")
 """Perception pipelines that know the clips by the steps of the state."""
 
@@ -65,20 +67,6 @@ class Made:
     """Generated clip."""
     latency: Latency
     """Latency of its frames."""
-
-
-@runtime_checkable
-class Run(Protocol):
-    """Function that runs a phase of a clip, or returns the result that it kept of it."""
-
-    def __call__(self, name: Phase, make: Callable[[], Any]) -> Any:
-        """Return the result of a phase."""
-        ...
-
-
-def run_phase(name: Phase, make: Callable[[], T]) -> T:
-    """Run a phase (`Run`)."""
-    return make()
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -135,17 +123,19 @@ class Simulator:
         action: Action,
         *,
         seed: int,
-        first_frame: UInt8[np.ndarray, "h w 3"] | None = None,
+        first_frame: RgbImage | None = None,
+        frames: Video | None = None,
         run: Run | None = None,
     ) -> Step:
         """Advance the world by one clip. The caller's state is not changed.
 
-        `first_frame` defaults to the first frame of the view. `run` runs the phases, or returns
-        what it kept of them.
+        `first_frame` defaults to the first frame of the view. `frames` are the clip's, if it is
+        made already. `run` runs the phases, or returns what it kept of them.
         """
-        run = run or run_phase
         clip = OpenClip(self, state, seed=seed, first_frame=first_frame, run=run)
-        made = run("generate", lambda: clip.make(action))
+        if frames is not None:
+            clip.keep(frames)
+        made = clip.run("generate", lambda: clip.make(action))
         if not clip.is_made:  # its frames were kept
             clip.replay(made, action)
         return clip.finish(action)
@@ -166,7 +156,7 @@ class Simulator:
         """Merge a perceived clip into the state."""
         return fuse(state, perceived, fusion=self.fusion)
 
-    def check(self, frames: np.ndarray, view: View) -> UInt8[np.ndarray, "f h w 3"]:
+    def check(self, frames: np.ndarray, view: View) -> Video:
         """Return the generator's frames. Raises `InputError` if their shape is not the view's."""
         if frames.shape != view.frames.shape or frames.dtype != np.uint8:
             raise InputError(
@@ -185,7 +175,7 @@ class OpenClip:
         state: SceneState,
         *,
         seed: int,
-        first_frame: UInt8[np.ndarray, "h w 3"] | None = None,
+        first_frame: RgbImage | None = None,
         run: Run | None = None,
     ):
         """Begin a clip; `first_frame` defaults to the first frame of the view."""
@@ -196,7 +186,9 @@ class OpenClip:
         """Latency of each chunk that was taken."""
         self.notes: tuple[str, ...] = ()
         """Words of the perception."""
-        self._seed, self._first_frame, self._run = seed, first_frame, run or run_phase
+        self.run: Run = run or (lambda name, make: make())
+        """Runs each phase."""
+        self._seed, self._first_frame = seed, first_frame
         self._stream: ClipStream | None = None
         self._put: list[tuple[FrameTimer, View, Action]] = []
         self._frames: list[UInt8[np.ndarray, "f h w 3"]] = []
@@ -214,7 +206,7 @@ class OpenClip:
         return self.simulator.update_every == "chunk" and self.simulator.perception is not None
 
     @property
-    def frames(self) -> UInt8[np.ndarray, "f h w 3"]:
+    def frames(self) -> Video:
         """Frames of the chunks that were taken."""
         return np.concatenate(self._frames)
 
@@ -242,11 +234,15 @@ class OpenClip:
 
     def replay(self, made: Made, action: Action) -> None:
         """Go through a clip that was made before, in the chunks in which it was made."""
-        lengths = self.lengths or (len(made.clip.frames),)
-        chunks = np.split(made.clip.frames, np.cumsum(lengths)[:-1])
-        self._stream, self._kept = KeptStream(iter(chunks)), made.latency
+        self.keep(made.clip.frames)
+        self._kept = made.latency
         self.simulator = replace(self.simulator, show=None)
         self.make(action)
+
+    def keep(self, frames: Video) -> None:
+        """Take the frames of a clip that is made already, instead of the generator's."""
+        lengths = self.lengths or (len(frames),)
+        self._stream = KeptStream(iter(np.split(frames, np.cumsum(lengths)[:-1])))
 
     def put(self, action: Action, show: Show | None = None) -> None:
         """Begin the next chunk, from the cameras and hands of its frames; do not wait for it.
@@ -255,8 +251,8 @@ class OpenClip:
         """
         simulator = self.simulator
         timer = FrameTimer(show or simulator.show)
-        motion = self._run("predict", lambda: self._predict(action))
-        view = self._run("render", lambda: simulator.render(self.state, action, motion))
+        motion = self.run("predict", lambda: self._predict(action))
+        view = self.run("render", lambda: simulator.render(self.state, action, motion))
         if self._stream is None:
             image = view.frames[0] if self._first_frame is None else self._first_frame
             self._stream = begin(simulator.generator, image, self._seed)
@@ -279,7 +275,7 @@ class OpenClip:
             },
         )
 
-    def take(self) -> UInt8[np.ndarray, "f h w 3"]:
+    def take(self) -> Video:
         """Return the frames of the oldest chunk that was put; show each group as it is decoded."""
         timer, view, action = self._put[len(self._frames)]
         groups = []
@@ -295,7 +291,7 @@ class OpenClip:
         self._frames.append(frames)
         return frames
 
-    def _update_by_chunk(self, frames: UInt8[np.ndarray, "f h w 3"], action: Action) -> None:
+    def _update_by_chunk(self, frames: Video, action: Action) -> None:
         """Update the state by a chunk, which is perceived from the last frame before it on."""
         if self._frames:
             before = slice_action(self._put[len(self._frames) - 1][2], -1, None)
@@ -309,7 +305,7 @@ class OpenClip:
 
     def finish(self, action: Action) -> Step:
         """Return the step of the clip, once all its chunks are taken; the action is the clip's."""
-        simulator, before, run = self.simulator, self.state, self._run
+        simulator, before, run = self.simulator, self.state, self.run
         clip = Clip(frames=self.frames, fps=simulator.fps)
         if self.by_chunk:
             self.state = run("fuse", lambda: before)

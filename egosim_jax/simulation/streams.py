@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from egosim_jax.types import Action, View
+from egosim_jax.types.arrays import RgbImage, Video
 
 Show = Callable[[UInt8[np.ndarray, "g h w 3"]], None]
 """Callback for each decoded group of frames."""
@@ -28,9 +29,7 @@ class VideoGenerator(Protocol):
     the default side of a point in pixels, and a view of objects at rest.
     """
 
-    def __call__(
-        self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
-    ) -> UInt8[np.ndarray, "f h w 3"]:
+    def __call__(self, view: View, action: Action, first_frame: RgbImage, seed: int) -> Video:
         """Generate the frames of a clip, of the view's number and size."""
         ...
 
@@ -40,7 +39,7 @@ class StreamedGenerator(VideoGenerator, Protocol):
     """Generator that yields the first frames of a video before it has the last ones."""
 
     def stream(
-        self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
+        self, view: View, action: Action, first_frame: RgbImage, seed: int
     ) -> Iterator[UInt8[np.ndarray, "g h w 3"]]:
         """Yield the frames of a clip in order, in groups."""
         ...
@@ -68,7 +67,7 @@ class ChunkedGenerator(VideoGenerator, Protocol):
         """Frames of each chunk of a clip."""
         ...
 
-    def begin(self, first_frame: UInt8[np.ndarray, "h w 3"], seed: int) -> ClipStream:
+    def begin(self, first_frame: RgbImage, seed: int) -> ClipStream:
         """Begin a clip."""
         ...
 
@@ -111,9 +110,7 @@ def chunk_frames(generator: VideoGenerator) -> tuple[int, ...] | None:
     return generator.chunk_frames if isinstance(generator, ChunkedGenerator) else None
 
 
-def begin(
-    generator: VideoGenerator, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
-) -> ClipStream:
+def begin(generator: VideoGenerator, first_frame: RgbImage, seed: int) -> ClipStream:
     """Begin a clip; a generator that makes clips at once gets one chunk."""
     if isinstance(generator, ChunkedGenerator):
         return generator.begin(first_frame, seed)

@@ -10,10 +10,10 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from egosim_jax.geometry import umeyama
 from egosim_jax.types import InputError
+from egosim_jax.types.arrays import Pose, Poses
 
 CameraMethod = Literal["centers", "orientations", "orientations and scale"]
 """Camera alignment method.
@@ -23,11 +23,11 @@ cameras and then the translation between their centers, without or with a scale.
 
 
 def align_cameras(
-    reconstruction_from_camera: Float[np.ndarray, "f 4 4"],
-    world_from_camera: Float[np.ndarray, "f 4 4"],
+    reconstruction_from_camera: Poses,
+    world_from_camera: Poses,
     *,
     method: CameraMethod = "orientations",
-) -> Float[np.ndarray, "4 4"]:
+) -> Pose:
     """Return `world_from_reconstruction` from cameras that are known in both.
 
     Orientations need one camera (two for a scale); centers alone need three non-collinear ones.

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from egosim_jax.geometry import pixel_rays, transform, upsample_intrinsics
 from egosim_jax.state.silhouettes import unmix_colors
 from egosim_jax.types import InputError, SceneState, check_counts
+from egosim_jax.types.arrays import DepthMap, Mask, Matrix, Pose, RgbImage
 
 DEPTH_M = (0.05, 50.0)
 """Minimum and maximum median depth, in meters."""
@@ -29,9 +30,9 @@ FLAT = 0.01
 @no_type_check  # shapes and dtypes are checked with messages for users
 def state_from_depth(
     image: UInt8[np.ndarray, "_ _ 3"],
-    depth_m: Float[np.ndarray, "h w"],
-    intrinsics_px: Float[np.ndarray, "3 3"],
-    world_from_camera: Float[np.ndarray, "4 4"],
+    depth_m: DepthMap,
+    intrinsics_px: Matrix,
+    world_from_camera: Pose,
     *,
     object_ids: Int[np.ndarray, "_ _"] | None = None,
     names: Mapping[int, str] | None = None,
@@ -70,10 +71,10 @@ def state_from_depth(
 @no_type_check  # shapes and dtypes are checked with messages for users
 def known_depth(
     image: UInt8[np.ndarray, "_ _ 3"],
-    depth_m: Float[np.ndarray, "h w"],
-    intrinsics_px: Float[np.ndarray, "3 3"],
+    depth_m: DepthMap,
+    intrinsics_px: Matrix,
     object_ids: Int[np.ndarray, "_ _"] | None = None,
-) -> Bool[np.ndarray, "h w"]:
+) -> Mask:
     """Return the pixels with the depth of a surface: positive, finite, not between two surfaces.
 
     Raises `InputError` as `state_from_depth` does.
@@ -114,7 +115,7 @@ def known_depth(
     return valid & ~smeared
 
 
-def between_surfaces(depth_m: Float[np.ndarray, "h w"], focal_px: float) -> Bool[np.ndarray, "h w"]:
+def between_surfaces(depth_m: DepthMap, focal_px: float) -> Mask:
     """Return the pixels whose depth is between two surfaces that they do not belong to.
 
     Along a row or a column, such pixels are a short steep ramp with a surface at each end. A sharp
@@ -149,11 +150,7 @@ def between_surfaces(depth_m: Float[np.ndarray, "h w"], focal_px: float) -> Bool
 
 
 def _split(
-    image: UInt8[np.ndarray, "h w 3"],
-    depth_m: Float[np.ndarray, "h w"],
-    valid: Bool[np.ndarray, "h w"],
-    ids: Int[np.ndarray, "h w"],
-    times: int,
+    image: RgbImage, depth_m: DepthMap, valid: Mask, ids: Int[np.ndarray, "h w"], times: int
 ) -> tuple[
     UInt8[np.ndarray, "r c 3"],
     Float[np.ndarray, "r c"],

@@ -13,10 +13,12 @@ never reaches stages 3 and 4.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
+
+from egosim_jax.types.arrays import DepthMaps, IdMaps, Mask
 
 MIN_BOX_IOU = 0.15
 """Minimum IoU of the boxes of an object and a hand that interact."""
@@ -41,9 +43,7 @@ def is_held(name: str) -> bool:
 
 
 def interacted_frames(
-    object_ids: Int32[np.ndarray, "f h w"],
-    depth_m: Float32[np.ndarray, "f h w"],
-    names: Mapping[int, str],
+    object_ids: IdMaps, depth_m: DepthMaps, names: Mapping[int, str]
 ) -> InteractedFrames:
     """Return the frames in which hands acted on each object; objects without any are absent."""
     frames_of: InteractedFrames = {}
@@ -61,9 +61,7 @@ def interacted_frames(
     return frames_of
 
 
-def disappeared_objects(
-    object_ids: Int32[np.ndarray, "f h w"], interactions: InteractedFrames
-) -> set[int]:
+def disappeared_objects(object_ids: IdMaps, interactions: InteractedFrames) -> set[int]:
     """Return the objects that are invisible in all frames after their last interaction."""
     lost = set()
     for number, frames in interactions.items():
@@ -79,10 +77,10 @@ def is_interacting(
 ) -> bool:
     """Return whether an object and any hand or arm interact in one frame (stages 2 and 3)."""
     instance = ids == number
-    box, distance = _box(instance), _median(depth_m[instance])
+    box, distance = mask_box(instance), _median(depth_m[instance])
     for number_of_hand in np.unique(ids[ids < 0]):
         hand = ids == number_of_hand
-        if box_iou(box, _box(hand)) > MIN_BOX_IOU:
+        if box_iou(box, mask_box(hand)) > MIN_BOX_IOU:
             gap = abs(distance - _median(depth_m[hand]))
             if np.isnan(gap) or gap < MAX_DEPTH_GAP_M:  # unknown depth excludes nothing
                 return True
@@ -100,15 +98,16 @@ def _median(depths: Float32[np.ndarray, " n"]) -> float:
     return float(np.median(finite)) if len(finite) else float("nan")
 
 
-def _box(mask: Bool[np.ndarray, "h w"]) -> Box:
-    """Return first and one past the last row, first and one past the last column of a mask."""
+def mask_box(mask: Mask) -> Box:
+    """Return first column and row of a mask, and one past the last ones."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
-def box_iou(a: Box, b: Box) -> float:
-    """Return the intersection over union of two boxes (rows from and to, columns from and to)."""
-    height = max(0, min(a[1], b[1]) - max(a[0], b[0]))
-    width = max(0, min(a[3], b[3]) - max(a[2], b[2]))
-    areas = [(box[1] - box[0]) * (box[3] - box[2]) for box in (a, b)]
-    return height * width / (sum(areas) - height * width)
+def box_iou(a: Sequence[int | float], b: Sequence[int | float]) -> float:
+    """Return the intersection over union of two boxes (first column and row, last ones)."""
+    width = max(0.0, min(a[2], b[2]) - max(a[0], b[0]))
+    height = max(0.0, min(a[3], b[3]) - max(a[1], b[1]))
+    areas = [(box[2] - box[0]) * (box[3] - box[1]) for box in (a, b)]
+    union = sum(areas) - width * height
+    return width * height / union if union > 0 else 0.0

@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 
 from egosim_jax.geometry import cameras_in_object_frame, invert, pixels_of, transform
 from egosim_jax.runtime.open3d import load_open3d, nearest, point_cloud
@@ -27,6 +27,7 @@ from egosim_jax.state.filter import disappeared_objects
 from egosim_jax.state.new_objects import with_objects
 from egosim_jax.state.tsdf import Fusion, surface, valid_depth_mask
 from egosim_jax.types import Perceived, SceneState
+from egosim_jax.types.arrays import Masks, Points
 
 REPLACE_M = 0.005
 """Distance within which a new point replaces points of the state, in meters."""
@@ -81,7 +82,7 @@ def fuse(state: SceneState, perceived: Perceived, *, fusion: Fusion | None = Non
 
 
 def reconstruct(
-    perceived: Perceived, valid: Bool[np.ndarray, "f h w"], disappeared: set[int], fusion: Fusion
+    perceived: Perceived, valid: Masks, disappeared: set[int], fusion: Fusion
 ) -> _Points:
     """Return the surfaces of background and objects at the clip's end, without disappeared ones."""
     usable = valid & ~dilate(perceived.object_ids < 0, HAND_MARGIN)
@@ -112,7 +113,7 @@ def reconstruct(
     return _remove_outliers(concat(pieces))
 
 
-def dilate(mask: Bool[np.ndarray, "f h w"], border: float) -> Bool[np.ndarray, "f h w"]:
+def dilate(mask: Masks, border: float) -> Masks:
     """Return masks dilated by a border: a fraction of the image width, at least one pixel."""
     import cv2
 
@@ -121,7 +122,7 @@ def dilate(mask: Bool[np.ndarray, "f h w"], border: float) -> Bool[np.ndarray, "
     return np.stack([cv2.dilate(frame.astype(np.uint8), square) > 0 for frame in mask])
 
 
-def _last_visible_frame(seen: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
+def _last_visible_frame(seen: Masks) -> Masks:
     frames = np.flatnonzero(seen.any(axis=(1, 2)))
     last = np.arange(len(seen)) == (frames[-1] if len(frames) else -1)
     return seen & last[:, None, None]
@@ -146,9 +147,7 @@ def apply_motion(state: SceneState, perceived: Perceived, disappeared: set[int])
     )[kept]
 
 
-def carve_free_space(
-    old: _Points, perceived: Perceived, valid: Bool[np.ndarray, "f h w"]
-) -> _Points:
+def carve_free_space(old: _Points, perceived: Perceived, valid: Masks) -> _Points:
     """Remove the points that the last frames with a view of them see through."""
     votes = np.zeros(len(old.points_m), int)
     observed = np.zeros(len(votes), bool)
@@ -165,7 +164,7 @@ def carve_free_space(
 
 
 def _surface_behind(
-    points_m: Float[np.ndarray, "n 3"],
+    points_m: Points,
     object_ids: Int[np.ndarray, " n"],
     perceived: Perceived,
     depth_m: Float32[np.ndarray, "h w"],

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32, UInt8
+from jaxtyping import Bool, Float, Float32, Int32
 
 from egosim_jax.geometry import pixel_rays
 from egosim_jax.runtime.open3d import point_cloud
@@ -22,6 +22,7 @@ from egosim_jax.state.depth import known_depth
 from egosim_jax.state.planes import SupportPlane, area_of, fit_plane, support_planes
 from egosim_jax.state.regions import RegionConfig, find_regions
 from egosim_jax.types import Counted, SceneState
+from egosim_jax.types.arrays import DepthMap, Mask, Matrix, Plane, Points, RgbImage, Vector
 
 UP = np.array([0.0, -1.0, 0.0])
 """Rough upward direction in camera coordinates."""
@@ -60,10 +61,7 @@ class ObjectSearch(Counted):
 
 @no_type_check  # shapes and dtypes are checked with messages for users
 def find_objects(
-    image: UInt8[np.ndarray, "h w 3"],
-    depth_m: Float[np.ndarray, "h w"],
-    intrinsics_px: Float[np.ndarray, "3 3"],
-    search: ObjectSearch | None = None,
+    image: RgbImage, depth_m: DepthMap, intrinsics_px: Matrix, search: ObjectSearch | None = None
 ) -> Int32[np.ndarray, "h w"]:
     """Return the object id of each pixel, from 1 for the largest; 0 is the background.
 
@@ -93,8 +91,8 @@ def find_objects(
 
 
 def _heights(
-    points: Float[np.ndarray, "h w 3"], valid: Bool[np.ndarray, "h w"], search: ObjectSearch
-) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    points: Float[np.ndarray, "h w 3"], valid: Mask, search: ObjectSearch
+) -> tuple[Float[np.ndarray, "h w"], Mask]:
     """Return the height of each pixel above the surface below it, and the candidates.
 
     The height is NaN where there is no surface below.
@@ -123,7 +121,7 @@ def _heights(
 
 
 def _without_tops(
-    surfaces: list[SupportPlane], cloud: Float[np.ndarray, "n 3"], search: ObjectSearch
+    surfaces: list[SupportPlane], cloud: Points, search: ObjectSearch
 ) -> list[SupportPlane]:
     """Return the surfaces without tops of objects: small ones above another surface."""
     kept = []
@@ -141,18 +139,13 @@ def _without_tops(
     return kept
 
 
-def _on_plane(
-    points_m: Float[np.ndarray, "n 3"], plane: Float[np.ndarray, " 4"]
-) -> Float[np.ndarray, "n 2"]:
+def _on_plane(points_m: Points, plane: Plane) -> Float[np.ndarray, "n 2"]:
     """Return coordinates of points along two axes of a plane, in meters."""
     return points_m @ np.linalg.svd(plane[None, :3])[2][1:].T
 
 
 def _above(
-    surface: SupportPlane,
-    cloud: Float[np.ndarray, "n 3"],
-    tolerance_m: float,
-    search: ObjectSearch,
+    surface: SupportPlane, cloud: Points, tolerance_m: float, search: ObjectSearch
 ) -> tuple[Float[np.ndarray, " n"], float, Bool[np.ndarray, " n"]]:
     """Return heights above a surface, their deviation on it, and which points are over it."""
     import cv2
@@ -181,9 +174,7 @@ def _above(
     return bent, deviation, beyond <= search.outline_m
 
 
-def _walls(
-    cloud: Float[np.ndarray, "n 3"], surfaces: list[SupportPlane], tolerance_m: float
-) -> list[int]:
+def _walls(cloud: Points, surfaces: list[SupportPlane], tolerance_m: float) -> list[int]:
     """Return the indices of the points on walls."""
     rest, planes = np.arange(len(cloud)), []
     for _ in range(MAX_WALLS if surfaces else 0):
@@ -236,7 +227,7 @@ def _grow_down(
     labels: Int32[np.ndarray, "h w"],
     lab: Float32[np.ndarray, "h w 3"],
     heights: Float[np.ndarray, "h w"],
-    valid: Bool[np.ndarray, "h w"],
+    valid: Mask,
     search: ObjectSearch,
 ) -> Int32[np.ndarray, "h w"]:
     """Return labels with the feet of objects, which are nearer to the surface than its noise.
@@ -280,7 +271,7 @@ def _refine(
     return np.where(same, fine, 0).astype(np.int32)
 
 
-def object_sizes(state: SceneState) -> dict[int, Float[np.ndarray, " 3"]]:
+def object_sizes(state: SceneState) -> dict[int, Vector]:
     """Return the extents of each object's points along its own axes in meters, ascending."""
     sizes = {}
     for number in np.unique(state.object_ids[state.object_ids > 0]).tolist():

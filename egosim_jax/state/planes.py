@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from egosim_jax.geometry import UP_AXES, upward
 from egosim_jax.runtime.open3d import load_open3d, point_cloud
 from egosim_jax.types import SceneState
+from egosim_jax.types.arrays import Plane, Points, Pose, Vector
 
 ITERATIONS = 500
 """Number of RANSAC trials per plane."""
@@ -46,14 +47,12 @@ class SupportPlane:
     inliers: Int[np.ndarray, " n"]
     """Indices of the points on the surface, and on no larger one."""
 
-    def heights(self, points_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def heights(self, points_m: Points) -> Float[np.ndarray, " n"]:
         """Return the heights of points above the surface, in meters."""
         return points_m @ self.plane[:3] + self.plane[3]
 
 
-def fit_plane(
-    points_m: Float[np.ndarray, "n 3"], tolerance_m: float
-) -> tuple[Float[np.ndarray, " 4"], Int[np.ndarray, " k"]]:
+def fit_plane(points_m: Points, tolerance_m: float) -> tuple[Plane, Int[np.ndarray, " k"]]:
     """Return the plane with the most inliers (RANSAC, the same in every run), and the inliers.
 
     It needs at least three points.
@@ -69,10 +68,10 @@ def fit_plane(
 
 
 def support_planes(
-    points_m: Float[np.ndarray, "n 3"],
-    up: Float[np.ndarray, " 3"],
+    points_m: Points,
+    up: Vector,
     *,
-    eye_m: Float[np.ndarray, " 3"] | None = None,
+    eye_m: Vector | None = None,
     tolerance_m: float = TOLERANCE_M,
     min_points: int = MIN_PLANE_POINTS,
     max_planes: int | None = None,
@@ -109,9 +108,7 @@ def support_planes(
     return surfaces
 
 
-def main_support(
-    state: SceneState, world_from_camera: Float[np.ndarray, "4 4"]
-) -> Float[np.ndarray, " 4"] | None:
+def main_support(state: SceneState, world_from_camera: Pose) -> Plane | None:
     """Return the support plane that most background points are on, if there is one.
 
     The camera looks down at it. The tabletop world's table is at z = 0.
@@ -123,9 +120,7 @@ def main_support(
     return planes[0].plane if planes else None
 
 
-def vertical(
-    state: SceneState, world_from_camera: Float[np.ndarray, "4 4"] | None = None
-) -> Float[np.ndarray, " 3"]:
+def vertical(state: SceneState, world_from_camera: Pose | None = None) -> Vector:
     """Return the unit vector that points up in a state's world.
 
     It is the normal of the main support; without one, the camera's upward direction. Without a
@@ -148,13 +143,13 @@ def vertical(
     return np.array(max(UP_AXES.values(), key=lambda axis: normal @ axis))
 
 
-def _background(state: SceneState) -> Float[np.ndarray, "n 3"]:
+def _background(state: SceneState) -> Points:
     """Return some of the background points of a state."""
     points = state.points_m[state.object_ids == 0].astype(float)
     return points[:: max(1, len(points) // MAX_MAIN_POINTS)]
 
 
-def area_of(points_m: Float[np.ndarray, "n 3"], plane: Float[np.ndarray, " 4"]) -> float:
+def area_of(points_m: Points, plane: Plane) -> float:
     """Return the area that the points cover on the plane, in cells of 2 cm."""
     cell = 0.02
     side = np.linalg.svd(plane[None, :3])[2][1:]

@@ -8,7 +8,8 @@ skipped, but must be complete.
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -52,38 +53,26 @@ def read_points(path: Path) -> np.ndarray:
 
     Raises `InputError` if it is not a PLY file, damaged, truncated or too large.
     """
-    name = quote_path(path)
-    with open_regular(path) as file:
-        try:
-            order, elements = _header(file)
-            vertex = next((e for e in elements if e.name == "vertex"), None)
-            if vertex is None or not 0 < vertex.count <= MAX_POINTS:
-                count = vertex.count if vertex else 0
-                raise ValueError(f"it has {quote(count)} points; expected 1 to {MAX_POINTS:,}")
-            number = elements.index(vertex)
-            if vertex.lists or any(element.lists for element in elements[:number]):
-                raise ValueError("a list property precedes the points or belongs to them")
-            limit = MAX_TEXT if order == "=" else MAX_BYTES
-            data = file.read(limit + 1)
-            if len(data) > limit:
-                raise ValueError(f"it has more than {limit:,} bytes, the limit")
-            read = _text if order == "=" else _binary
-            return read(data, order, elements, number)
-        except ValueError as error:
-            raise InputError(f"{name} is not a readable PLY file: {quote_text(str(error))}.") from (
-                error
-            )
+    with _open(path) as (file, order, elements):
+        vertex = next((e for e in elements if e.name == "vertex"), None)
+        if vertex is None or not 0 < vertex.count <= MAX_POINTS:
+            count = vertex.count if vertex else 0
+            raise ValueError(f"it has {quote(count)} points; expected 1 to {MAX_POINTS:,}")
+        number = elements.index(vertex)
+        if vertex.lists or any(element.lists for element in elements[:number]):
+            raise ValueError("a list property precedes the points or belongs to them")
+        limit = MAX_TEXT if order == "=" else MAX_BYTES
+        data = file.read(limit + 1)
+        if len(data) > limit:
+            raise ValueError(f"it has more than {limit:,} bytes, the limit")
+        read = _text if order == "=" else _binary
+        return read(data, order, elements, number)
 
 
 def has_triangles(path: Path) -> bool:
     """Return whether a PLY file has faces."""
-    with open_regular(path) as file:
-        try:
-            return any(e.name == "face" and e.count > 0 for e in _header(file)[1])
-        except ValueError as error:
-            raise InputError(
-                f"{quote_path(path)} is not a readable PLY file: {quote_text(str(error))}."
-            ) from error
+    with _open(path) as (_, _, elements):
+        return any(e.name == "face" and e.count > 0 for e in elements)
 
 
 def read_triangles(path: Path) -> np.ndarray:
@@ -93,8 +82,7 @@ def read_triangles(path: Path) -> np.ndarray:
     """
     name = quote_path(path)
     points = read_points(path)
-    with open_regular(path) as file:
-        order, elements = _header(file)
+    with _open(path) as (file, order, elements):
         data = file.read(MAX_BYTES)
     number = next((k for k, e in enumerate(elements) if e.name == "face"), None)
     faces = None if number is None else elements[number]
@@ -131,6 +119,17 @@ def write_points(path: Path, columns: Mapping[str, np.ndarray]) -> None:
     lines += [f"property {_NAMES[dtype]} {name}" for name, dtype in dtypes.items()]
     with atomic_write(path) as temporary:
         temporary.write_bytes("\n".join([*lines, "end_header\n"]).encode() + points.tobytes())
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[tuple[io.BufferedReader, str, list[_Element]]]:
+    """Open a file after its header, and raise `InputError` with its name for a `ValueError`."""
+    with open_regular(path) as file:
+        try:
+            yield file, *_header(file)
+        except ValueError as error:
+            why = quote_text(str(error))
+            raise InputError(f"{quote_path(path)} is not a readable PLY file: {why}.") from error
 
 
 def _header(file: io.BufferedReader) -> tuple[str, list[_Element]]:

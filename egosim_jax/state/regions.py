@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32
 
+from egosim_jax.types.arrays import DepthMap, Mask
+
 WEAK = 0.25
 """Evidence of a border that is smooth or has one color, but not both, relative to a sure one."""
 LIGHTNESS = 0.5
@@ -57,11 +59,6 @@ class _Sets:
             item = parent[item]
         return item
 
-    def join(self, one: int, other: int) -> int:
-        """Join two sets by their representatives; return the representative of both."""
-        self.parent[other] = one
-        return one
-
     def labels(self) -> Int[np.ndarray, " n"]:
         """Return the representative of every item."""
         return np.array([self.find(item) for item in range(len(self.parent))], int)
@@ -70,7 +67,7 @@ class _Sets:
 def find_regions(
     points: Float[np.ndarray, "h w 3"],
     lab: Float32[np.ndarray, "h w 3"],
-    candidates: Bool[np.ndarray, "h w"],
+    candidates: Mask,
     footprint_m: Float[np.ndarray, "h w"],
     config: RegionConfig,
 ) -> Int32[np.ndarray, "h w"]:
@@ -96,10 +93,7 @@ def _compact(parts: Int[np.ndarray, " n"]) -> Int32[np.ndarray, " n"]:
 
 
 def _neighbors(
-    depth_m: Float[np.ndarray, "h w"],
-    candidates: Bool[np.ndarray, "h w"],
-    footprint_m: Float[np.ndarray, "h w"],
-    config: RegionConfig,
+    depth_m: DepthMap, candidates: Mask, footprint_m: Float[np.ndarray, "h w"], config: RegionConfig
 ) -> Int[np.ndarray, "e 2"]:
     """Return the pairs of adjacent candidates without a jump of depth, as flat indices."""
     index = np.arange(depth_m.size).reshape(depth_m.shape)
@@ -131,7 +125,7 @@ def _by_color(
     for (one, other), weight in zip(alike_first, weights[order].tolist(), strict=True):
         a, b = sets.find(one), sets.find(other)
         if a != b and weight <= min(limit[a], limit[b]):
-            sets.join(a, b)
+            sets.parent[b] = a
             size[a] += size[b]
             limit[a] = weight + config.color_scale / size[a]
     _absorb_small(sets, size, alike_first, config.min_pixels)
@@ -139,10 +133,7 @@ def _by_color(
 
 
 def _absorb_small(
-    sets: _Sets,
-    size: list[int],
-    alike_first: list[list[int]],
-    min_pixels: float,
+    sets: _Sets, size: list[int], alike_first: list[list[int]], min_pixels: float
 ) -> None:
     """Join each small set with its neighbor of the most similar pixels.
 
@@ -152,7 +143,7 @@ def _absorb_small(
     for one, other in alike_first:
         a, b = sets.find(one), sets.find(other)
         if a != b and min(size[a], size[b]) < min_pixels:
-            sets.join(a, b)
+            sets.parent[b] = a
             size[a] += size[b]
 
 

@@ -7,9 +7,10 @@ object has moved, its color would stay there as a ring on the background.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Int, UInt8
 
 from egosim_jax.geometry import invert, project, transform
+from egosim_jax.types.arrays import Matrix, Points, Pose
 
 MIXED_PX = 1.0
 """Maximum distance of mixed colors from an object, along rows and columns, in pixels."""
@@ -22,11 +23,11 @@ MIN_DEPTH_M = 0.01
 
 
 def unmix_colors(
-    points_m: Float[np.ndarray, "n 3"],
+    points_m: Points,
     colors: UInt8[np.ndarray, "n 3"],
     object_ids: Int[np.ndarray, " n"],
-    world_from_camera: Float[np.ndarray, "4 4"],
-    intrinsics_px: Float[np.ndarray, "3 3"],
+    world_from_camera: Pose,
+    intrinsics_px: Matrix,
 ) -> UInt8[np.ndarray, "n 3"]:
     """Return the colors, with mixed ones of the background replaced by colors of farther points.
 
@@ -60,9 +61,7 @@ def unmix_colors(
     return unmixed
 
 
-def _is_mix(
-    colors: UInt8[np.ndarray, "n 3"], a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]
-) -> Bool[np.ndarray, " n"]:
+def _is_mix(colors: UInt8[np.ndarray, "n 3"], a: Points, b: Points) -> Bool[np.ndarray, " n"]:
     """Return which colors are within `MAX_OFF_MIX` of the line from color a to color b."""
     way = b - a
     share = ((colors - a) * way).sum(axis=1) / np.maximum((way**2).sum(axis=1), 1.0)

@@ -11,11 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32, Shaped, UInt8
+from jaxtyping import Float, Float32, Int32, Shaped, UInt8
 
 from egosim_jax.geometry import pixel_rays, transform
 from egosim_jax.runtime.open3d import load_open3d
 from egosim_jax.types import Cameras, InputError
+from egosim_jax.types.arrays import DepthMaps, Mask, Masks, Pose, Video
 
 DEPTH_WINDOW_PX = 5
 """Size in pixels of the window in which depths are compared."""
@@ -53,7 +54,7 @@ class Fusion:
             )
 
 
-def valid_depth_mask(depth_m: Float32[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
+def valid_depth_mask(depth_m: DepthMaps) -> Masks:
     """Return the pixels whose depth is known and continuous; at edges, depths of surfaces mix."""
     import cv2
 
@@ -66,11 +67,7 @@ def valid_depth_mask(depth_m: Float32[np.ndarray, "f h w"]) -> Bool[np.ndarray, 
 
 
 def surface(
-    depth_m: Float32[np.ndarray, "f h w"],
-    colors: UInt8[np.ndarray, "f h w 3"],
-    cameras: Cameras,
-    *,
-    fusion: Fusion,
+    depth_m: DepthMaps, colors: Video, cameras: Cameras, *, fusion: Fusion
 ) -> tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
     """Return points and colors of the surface that the frames observe, in the cameras' world.
 
@@ -125,8 +122,8 @@ def surface(
 
 def _blocks(
     depth_m: Float32[np.ndarray, "h w"],
-    valid: Bool[np.ndarray, "h w"],
-    grid_from_camera: Float[np.ndarray, "4 4"],
+    valid: Mask,
+    grid_from_camera: Pose,
     rays: Float[np.ndarray, "h w 3"],
     focal_px: float,
     fusion: Fusion,

@@ -6,6 +6,7 @@ generator in any framework can use these types.
     Triplet, Clip, Action, View, SceneState, Perceived, GroundTruth   the data flow (`data.py`)
     Motion, ObjectPath, Cause                                         predictions (`motion.py`)
     Cameras, is_rigid                                                 camera paths (`cameras.py`)
+    Video, Masks, Pose, Points, ...                                   shapes (`arrays.py`)
     InputError, Counted, VideoSpec, VideoGrid, MeshConfig, check_*    sizes (`settings.py`)
 
 Shapes are channel-last everywhere:

@@ -39,7 +39,7 @@ from egosim_jax.io.atomic import atomic_folder
 from egosim_jax.io.bounded import check_inside, only_inside, quote, quote_path, read_json
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.run import plain, write_json
-from egosim_jax.simulation.rollout import RecordedClip, Rollout, load_clip
+from egosim_jax.simulation.rollout import Rollout, load_clip
 from egosim_jax.simulation.start import Start, check_size
 from egosim_jax.simulation.streams import Latency, Show
 from egosim_jax.state import snapshot
@@ -329,13 +329,14 @@ class Session:
         folder, action, now = self._step(number), self.action(number), self.now
         simulator = replace(self.backend.simulator(now), show=show)
         generator = simulator.generator
-        if frames is not None:
-            made = RecordedClip(generator=generator, frames=frames)
-            simulator = replace(simulator, generator=made)
         with announced(generator) if frames is None else nullcontext():
             name = f"session {self.id}, step {number}"
             (step,) = Rollout(simulator, folder / "rollout", name=name).run(
-                now.state, [action], seed=now.seed + now.steps, first_frame=now.first_frame
+                now.state,
+                [action],
+                seed=now.seed + now.steps,
+                first_frame=now.first_frame,
+                frames=frames,
             )
         request = self._request(number)
         info = {

@@ -45,14 +45,21 @@ MAX_REPLY = 1 << 30
 
 
 class ChildError(RuntimeError):
-    """Raised when a child process ends during a call; says how, with its last message."""
+    """Raised when a child process ends during a call; says how, with its last lines."""
 
 
 class Child:
     """A child process that runs functions; the first call starts it."""
 
-    def __init__(self, *, max_memory: int | None = None) -> None:
-        self._max_memory = max_memory
+    def __init__(
+        self,
+        *,
+        max_memory: int | None = None,
+        max_reply: int | None = MAX_REPLY,
+        tail_lines: int = 1,
+    ) -> None:
+        self._max_memory, self._max_reply = max_memory, max_reply
+        self._tail_lines = tail_lines  # of its error output, in the message of a `ChildError`
         self._process: subprocess.Popen[bytes] | None = None
         self._connection: Connection
         self._log: IO[bytes]
@@ -71,7 +78,7 @@ class Child:
                 self._connection.send((run, arguments))
                 if self._connection.poll(timeout_s):
                     # A child that a file took over has the user's rights: pickle adds none.
-                    result = pickle.loads(self._connection.recv_bytes(MAX_REPLY))  # noqa: S301
+                    result = pickle.loads(self._connection.recv_bytes(self._max_reply))  # noqa: S301
                 else:
                     self.close()
                     result = TimeoutError()
@@ -124,7 +131,7 @@ class Child:
         return self._process
 
     def _ending(self, process: subprocess.Popen[bytes]) -> str:
-        """Close the child; return how it ended and the last message that it printed."""
+        """Close the child; return how it ended and the last lines that it printed."""
         with suppress(subprocess.TimeoutExpired):
             process.wait(1.0)  # a connection closes a moment before its process ends
         self._log.seek(max(0, self._log.seek(0, os.SEEK_END) - 20_000))
@@ -136,7 +143,9 @@ class Child:
         how = f"failed with exit code {code}" if code >= 0 else f"was ended by signal {-code}"
         with suppress(ValueError):
             how = f"was ended by {signal.Signals(-code).name}"
-        return f"{how}: {lines[-1][:300] if lines else 'no message'}"
+        shown = ("".join(filter(str.isprintable, line)) for line in lines[-self._tail_lines :])
+        tail = "\n".join(line[:300] for line in shown)
+        return f"{how}: {tail or 'no message'}"
 
 
 def read_file(

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Int32
 
 from egosim_jax.dynamics.solids import hull_on_plane
 from egosim_jax.geometry import invert, pixel_rays, transform
@@ -25,6 +25,17 @@ from egosim_jax.rendering.reference import add_margin, close_gaps, splat
 from egosim_jax.state.fuse import dilate
 from egosim_jax.state.planes import fit_plane
 from egosim_jax.types import Action, Cameras, Clip, Counted, SceneState
+from egosim_jax.types.arrays import (
+    Colors,
+    DepthMaps,
+    IdMaps,
+    Masks,
+    Plane,
+    Points,
+    Poses,
+    Vector,
+    Video,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,14 +99,14 @@ class NewSurfaces(Counted):
 
     def _add(
         self,
-        frames: UInt8[np.ndarray, "f h w 3"],
+        frames: Video,
         cameras: Cameras,
-        depth: Float32[np.ndarray, "f h w"],
-        ids: Int32[np.ndarray, "f h w"],
-        motions: Mapping[int, Float[np.ndarray, "f 4 4"]],
-        supports: Mapping[int, Float[np.ndarray, " 4"]],
+        depth: DepthMaps,
+        ids: IdMaps,
+        motions: Mapping[int, Poses],
+        supports: Mapping[int, Plane],
         state: SceneState,
-    ) -> tuple[Float32[np.ndarray, "f h w"], Int32[np.ndarray, "f h w"]]:
+    ) -> tuple[DepthMaps, IdMaps]:
         """Return depth and object ids with new surfaces."""
         rest = ~np.isin(state.object_ids, list(motions))
         known_m, index = close_gaps(*splat(state.points_m[rest], add_margin(cameras), point_px=1))
@@ -122,9 +133,7 @@ class NewSurfaces(Counted):
             depth[seam] = there[seam]
         return depth, ids
 
-    def _other_colors(
-        self, state: SceneState, planes: Sequence[_Plane]
-    ) -> Float32[np.ndarray, "n 3"]:
+    def _other_colors(self, state: SceneState, planes: Sequence[_Plane]) -> Colors:
         """Return the colors, in bins, of background points that are on none of the planes."""
         points = state.points_m[state.object_ids == 0]
         away = np.full(len(points), np.inf)
@@ -136,10 +145,7 @@ class NewSurfaces(Counted):
         return (bins.astype(np.float32) + 0.5) * self.bin
 
     def _planes(
-        self,
-        state: SceneState,
-        rest: Bool[np.ndarray, " n"],
-        supports: list[Float[np.ndarray, " 4"]],
+        self, state: SceneState, rest: Bool[np.ndarray, " n"], supports: list[Plane]
     ) -> list[_Plane]:
         """Return the planes below moved objects, and the largest planes of the background."""
         planes = []
@@ -162,8 +168,8 @@ class NewSurfaces(Counted):
         return [plane for plane in planes if len(plane.points_m) >= self.compared_points]
 
     def _wall(
-        self, points_m: Float32[np.ndarray, "n 3"], up: Float[np.ndarray, " 3"]
-    ) -> tuple[Float[np.ndarray, " 4"], Int[np.ndarray, " k"]]:
+        self, points_m: Float32[np.ndarray, "n 3"], up: Vector
+    ) -> tuple[Plane, Int[np.ndarray, " k"]]:
         """Return the plane along `up` with the most inliers, and the inliers.
 
         The frames show a strip of a wall, which does not determine a plane of any direction. Copies
@@ -192,11 +198,8 @@ class _Plane(_Surface):
     """Plane a x + b y + c z + d = 0."""
 
     def meet(
-        self,
-        eye: Float[np.ndarray, "n 3"],
-        toward: Float[np.ndarray, "n 3"],
-        frame: Int[np.ndarray, " n"],
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+        self, eye: Points, toward: Points, frame: Int[np.ndarray, " n"]
+    ) -> tuple[Float[np.ndarray, " n"], Points]:
         """Return depths, and where the rays meet the plane."""
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = -(eye @ self.plane[:3] + self.plane[3]) / (toward @ self.plane[:3])
@@ -212,11 +215,8 @@ class _Hull(_Surface):
     """World motion in each frame."""
 
     def meet(
-        self,
-        eye: Float[np.ndarray, "n 3"],
-        toward: Float[np.ndarray, "n 3"],
-        frame: Int[np.ndarray, " n"],
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+        self, eye: Points, toward: Points, frame: Int[np.ndarray, " n"]
+    ) -> tuple[Float[np.ndarray, " n"], Points]:
         """Return depths, and where the rays meet the hull, before its motion."""
         back = invert(self.motion)[frame]
         eye = transform(back, eye[:, None])[:, 0]
@@ -238,12 +238,7 @@ def _points_of(state: SceneState, chosen: Int[np.ndarray, " n"]) -> dict[str, np
     }
 
 
-def _hull(
-    number: int,
-    motion: Float[np.ndarray, "f 4 4"],
-    plane: Float[np.ndarray, " 4"],
-    state: SceneState,
-) -> _Hull | None:
+def _hull(number: int, motion: Poses, plane: Plane, state: SceneState) -> _Hull | None:
     """Return the hull of a moved object; None if its points do not span a volume."""
     chosen = np.flatnonzero(state.object_ids == number)
     hull = hull_on_plane(state.points_m[chosen].astype(float), plane)
@@ -267,13 +262,7 @@ class _Pixels:
     config: NewSurfaces
 
     @classmethod
-    def of(
-        cls,
-        new: Bool[np.ndarray, "f h w"],
-        frames: UInt8[np.ndarray, "f h w 3"],
-        cameras: Cameras,
-        config: NewSurfaces,
-    ) -> _Pixels:
+    def of(cls, new: Masks, frames: Video, cameras: Cameras, config: NewSurfaces) -> _Pixels:
         frame, row, column = np.nonzero(new)
         rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
         poses = cameras.world_from_camera[frame]
@@ -289,7 +278,7 @@ class _Pixels:
             config=config,
         )
 
-    def compete(self, colors: Float32[np.ndarray, "n 3"]) -> None:
+    def compete(self, colors: Colors) -> None:
         """Limit the color difference from a surface to that from the nearest of other colors.
 
         A wall behind a table may look like the table in another light, but it looks more like the
@@ -299,7 +288,7 @@ class _Pixels:
             apart = self.config.color.apart(self.shown, color[None])
             np.minimum(self.residual, apart, out=self.residual)
 
-    def offer(self, surface: _Plane | _Hull, where: Bool[np.ndarray, "f h w"]) -> None:
+    def offer(self, surface: _Plane | _Hull, where: Masks) -> None:
         """Take a surface in the pixels `where` it is near its points and has a better color."""
         from scipy.spatial import KDTree
 
@@ -320,7 +309,7 @@ class _Pixels:
         self.object_ids[some] = surface.object_ids[near[better, 0]]
 
 
-def plane_depth(plane: Float[np.ndarray, " 4"], cameras: Cameras) -> Float32[np.ndarray, "f h w"]:
+def plane_depth(plane: Plane, cameras: Cameras) -> DepthMaps:
     """Return the depth of a plane (a, b, c, d) in meters; infinite where a ray misses it."""
     rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
     normal, offset = plane[:3], plane[3]

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float32
 
 from egosim_jax.dynamics import Hold, Prediction, find_holds, possible_holds
 from egosim_jax.geometry import invert, transform
@@ -27,6 +27,7 @@ from egosim_jax.perception.objects.growth import NEW, Growth, clusters_without_i
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.state.new_objects import next_object_id, with_objects
 from egosim_jax.types import Action, Clip, InputError, SceneState, check_counts
+from egosim_jax.types.arrays import Poses, Video
 from egosim_jax.types.data import object_name
 from egosim_jax.types.motion import Motion, ObjectPath
 
@@ -301,9 +302,7 @@ class _Search:
         """Number of frames."""
         return len(self.film.shown)
 
-    def cost(
-        self, model: ObjectModel, path: Float[np.ndarray, "f 4 4"], film: Film | None = None
-    ) -> float:
+    def cost(self, model: ObjectModel, path: Poses, film: Film | None = None) -> float:
         """Return the mean difference between the object's colors and the clip's on a path.
 
         It is infinite if too few points are visible. `film` defaults to the whole clip.
@@ -340,7 +339,7 @@ def _sentence(action: Action, hand: int | None, note: str) -> str:
     return f"{one} {hand} {note}" if shown > 1 and hand is not None else f"the {one} {note}"
 
 
-def _smooth(frames: UInt8[np.ndarray, "f h w 3"], sigma: float) -> Float32[np.ndarray, "f h w 3"]:
+def _smooth(frames: Video, sigma: float) -> Float32[np.ndarray, "f h w 3"]:
     import cv2
 
     return np.stack([cv2.GaussianBlur(f.astype(np.float32), (0, 0), sigma) for f in frames])

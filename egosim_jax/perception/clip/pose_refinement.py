@@ -10,13 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float32
 
 from egosim_jax.geometry import cameras_in_object_frame, transform
 from egosim_jax.perception.objects.film import Film, ObjectModel, ObjectMotion
 from egosim_jax.rendering.reference import splat
 from egosim_jax.state.fuse import dilate
 from egosim_jax.types import InputError, SceneState, check_counts
+from egosim_jax.types.arrays import Plane, Poses
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +84,7 @@ def refine_pose(
     return replace(best, path=perturb(best, change))
 
 
-def perturb(best: ObjectMotion, change: Float[np.ndarray, " 4"]) -> Float[np.ndarray, "f 4 4"]:
+def perturb(best: ObjectMotion, change: Plane) -> Poses:
     """Return the path with a change that grows from the grasp to the release.
 
     The change is a translation in meters, and a rotation about the plane's normal through the
@@ -114,12 +115,7 @@ class _Neighborhood:
 
     @classmethod
     def of(
-        cls,
-        best: ObjectMotion,
-        film: Film,
-        path: Float[np.ndarray, "f 4 4"],
-        state: SceneState,
-        config: Refinement,
+        cls, best: ObjectMotion, film: Film, path: Poses, state: SceneState, config: Refinement
     ) -> _Neighborhood:
         """Return the neighborhood of an object on a path in a film."""
         others = state.object_ids != best.model.number
@@ -137,7 +133,7 @@ class _Neighborhood:
             point_px=config.point_px,
         )
 
-    def cost(self, path: Float[np.ndarray, "f 4 4"]) -> float:
+    def cost(self, path: Poses) -> float:
         """Return the mean difference between the clip and a rendering with the object on a path."""
         local = cameras_in_object_frame(self.film.cameras, path)
         depth, index = splat(self.model.points_m, local, point_px=self.point_px)

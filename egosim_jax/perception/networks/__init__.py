@@ -13,8 +13,8 @@ with other weights.
     VideoMae:                                                           video features
     NetworkError, close_workers:                                        worker processes
 
-`worker` and `child` are the two sides of the process, `checkpoint` reads folders of weights, and
-`closed_loop` is the pipeline `networks`.
+`worker` has both sides of the process, `checkpoint` reads folders of weights, and `closed_loop` is
+the pipeline `networks`.
 """
 
 from egosim_jax.perception.networks.depth_anything import DepthAnything

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from egosim_jax.types import InputError, check_counts
+from egosim_jax.types.arrays import Mask
 
 MAX_COMPARED = 5000
 """Approximate maximum number of pixels compared in a trial."""
@@ -42,10 +43,7 @@ class DepthAlignment:
             )
 
     def __call__(
-        self,
-        depth_m: Float32[np.ndarray, "h w"],
-        scene_m: Float32[np.ndarray, "h w"],
-        static: Bool[np.ndarray, "h w"],
+        self, depth_m: Float32[np.ndarray, "h w"], scene_m: Float32[np.ndarray, "h w"], static: Mask
     ) -> Float32[np.ndarray, "h w"]:
         """Return a depth map aligned with the scene's at static pixels.
 

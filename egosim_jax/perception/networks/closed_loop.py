@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
-from jaxtyping import Bool, Int32
 
 from egosim_jax.perception.classical import HandMasks, take_action
 from egosim_jax.perception.clip.object_motion import TrackObjects
@@ -44,6 +43,7 @@ from egosim_jax.rendering import POINT_PX
 from egosim_jax.rendering.reference import render
 from egosim_jax.state.filter import is_hand
 from egosim_jax.types import Action, Clip, InputError, SceneState, View, check_counts
+from egosim_jax.types.arrays import IdMaps, Masks
 
 DEPTH_NETWORKS = {
     "depth-anything": DepthAnything,
@@ -92,11 +92,7 @@ class Segment:
         return replace(so_far, object_ids=ids.astype(np.int32), names=names)
 
     def _match(
-        self,
-        labels: Int32[np.ndarray, "f h w"],
-        names: Mapping[int, str],
-        view: View,
-        state: SceneState,
+        self, labels: IdMaps, names: Mapping[int, str], view: View, state: SceneState
     ) -> dict[int, int]:
         """Return the state's id of each found instance, or a new id.
 
@@ -229,9 +225,7 @@ class NetworksConfig:
         stages = (take_action, self.hands, self.motion, segment, estimate)
         return Pipeline(stages=(*stages, find_interactions, keep_changes))
 
-    def _networks(
-        self,
-    ) -> tuple[DepthAnything | DepthPro | DepthAnything3, Grounded | Sam3]:
+    def _networks(self) -> tuple[DepthAnything | DepthPro | DepthAnything3, Grounded | Sam3]:
         common = {"device": self.device, "dtype": self.dtype, "timeout_s": self.timeout_s}
         depth = DEPTH_NETWORKS[self.depth](self.depth_folder, **common)
         if self.masks == "sam3":
@@ -256,7 +250,7 @@ def _split(phrases: str) -> tuple[str, ...]:
     return tuple(filter(None, (" ".join(phrase.split()) for phrase in phrases.split("."))))
 
 
-def _largest_iou(a: Bool[np.ndarray, "f h w"], b: Bool[np.ndarray, "f h w"]) -> float:
+def _largest_iou(a: Masks, b: Masks) -> float:
     """Return the maximum over frames of the intersection over union of two masks."""
     both, either = (a & b).sum(axis=(1, 2)), (a | b).sum(axis=(1, 2))
     return float((both / np.maximum(either, 1)).max())

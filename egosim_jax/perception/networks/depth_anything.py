@@ -11,13 +11,13 @@ from dataclasses import KW_ONLY, dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Bool, UInt8
 
 from egosim_jax.io.bounded import quote, quote_path
 from egosim_jax.perception.networks.checkpoint import Network, load_network
 from egosim_jax.perception.networks.worker import Run
 from egosim_jax.perception.video.estimates import CameraEstimate, DepthEstimate
 from egosim_jax.types import InputError
+from egosim_jax.types.arrays import Masks, Video
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,7 @@ class DepthAnything(Network):
             )
 
     def __call__(
-        self,
-        frames: UInt8[np.ndarray, "f h w 3"],
-        moving: Bool[np.ndarray, "f h w"],
-        estimate: CameraEstimate,
-        wanted: Sequence[int],
+        self, frames: Video, moving: Masks, estimate: CameraEstimate, wanted: Sequence[int]
     ) -> DepthEstimate:
         """Return depth in meters of the wanted frames. The cameras are not used."""
         reply, _ = self.ask({"frames": frames[np.asarray(wanted, np.int32)]}, batch=self.batch)

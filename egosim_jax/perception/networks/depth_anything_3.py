@@ -14,7 +14,6 @@ from dataclasses import KW_ONLY, dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Bool, UInt8
 
 from egosim_jax.geometry import invert
 from egosim_jax.io.bounded import quote, quote_path
@@ -25,6 +24,7 @@ from egosim_jax.perception.video.cameras.path import complete_path
 from egosim_jax.perception.video.depth.triangulate import triangulate_frames
 from egosim_jax.perception.video.estimates import CameraEstimate, DepthEstimate, Verdict
 from egosim_jax.types import Cameras, InputError, is_rigid
+from egosim_jax.types.arrays import Masks, Video
 
 MIN_VIEWS = 2
 """Minimum number of views for alignment with given cameras."""
@@ -65,11 +65,7 @@ class DepthAnything3(_DepthAnything3):
     """Number of evenly spaced frames that the network sees besides the wanted ones."""
 
     def __call__(
-        self,
-        frames: UInt8[np.ndarray, "f h w 3"],
-        moving: Bool[np.ndarray, "f h w"],
-        estimate: CameraEstimate,
-        wanted: Sequence[int],
+        self, frames: Video, moving: Masks, estimate: CameraEstimate, wanted: Sequence[int]
     ) -> DepthEstimate:
         """Return depth of the wanted frames, in the unit of the cameras if they move.
 
@@ -109,11 +105,7 @@ class DepthAnything3Cameras(_DepthAnything3):
     """Maximum median reprojection error of the corners in pixels."""
 
     def __call__(
-        self,
-        frames: UInt8[np.ndarray, "f h w 3"],
-        moving: Bool[np.ndarray, "f h w"],
-        *,
-        focal_px: float | None = None,
+        self, frames: Video, moving: Masks, *, focal_px: float | None = None
     ) -> CameraEstimate:
         """Return cameras and points, in meters for a metric checkpoint, or a refusal.
 

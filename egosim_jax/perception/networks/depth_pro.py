@@ -14,13 +14,14 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float
 
 from egosim_jax.perception.networks.checkpoint import Network, load_network
 from egosim_jax.perception.networks.pixels import PixelSettings, normalize, resize_maps, to_images
 from egosim_jax.perception.networks.worker import Run
 from egosim_jax.perception.video.estimates import CameraEstimate, DepthEstimate
 from egosim_jax.types import InputError
+from egosim_jax.types.arrays import Masks, Video
 
 FIELD_OF_VIEW_DEG = (10.0, 150.0)
 """Minimum and maximum plausible horizontal field of view in degrees."""
@@ -46,11 +47,7 @@ class DepthPro(Network):
             )
 
     def __call__(
-        self,
-        frames: UInt8[np.ndarray, "f h w 3"],
-        moving: Bool[np.ndarray, "f h w"],
-        estimate: CameraEstimate,
-        wanted: Sequence[int],
+        self, frames: Video, moving: Masks, estimate: CameraEstimate, wanted: Sequence[int]
     ) -> DepthEstimate:
         """Return depth in meters of the wanted frames, for the cameras' focal length if known.
 
@@ -65,12 +62,12 @@ class DepthPro(Network):
         depth_m = 1 / np.clip(inverse * (width / focal_px), *INVERSE_DEPTH)
         return DepthEstimate.measured(wanted, depth_m, metric=True)
 
-    def focal_px(self, frames: UInt8[np.ndarray, "f h w 3"]) -> float:
+    def focal_px(self, frames: Video) -> float:
         """Return the focal length of a video in pixels, from the median over its frames."""
         return focal_of(self._estimate(frames)[1], frames.shape[2])
 
     def _estimate(
-        self, frames: UInt8[np.ndarray, "f h w 3"]
+        self, frames: Video
     ) -> tuple[Float[np.ndarray, "f h w"], Float[np.ndarray, " f"]]:
         reply, _ = self.ask({"frames": frames})
         return reply["inverse_depth"], reply["field_of_view_deg"]

@@ -13,15 +13,16 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Bool, Int32, UInt8
+from jaxtyping import Bool
 
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.perception.networks.checkpoint import DType
-from egosim_jax.perception.networks.grounding_dino import Detection, GroundingDino, box_iou
+from egosim_jax.perception.networks.grounding_dino import Detection, GroundingDino
 from egosim_jax.perception.networks.tracking import Box, EdgeTam, Sam2Tracker, Sam3Tracker, Tracker
 from egosim_jax.perception.video.estimates import HandTracks
-from egosim_jax.state.filter import is_hand
+from egosim_jax.state.filter import box_iou, is_hand, mask_box
 from egosim_jax.types import check_counts
+from egosim_jax.types.arrays import IdMaps, Video
 
 HAND_MARGIN = 0.25
 """Border around a hand's keypoints, as a fraction of their extent."""
@@ -39,10 +40,7 @@ class _Track:
         """Return True if a detection in a frame is this object; a hand never matches an object."""
         if is_hand(self.phrase) != is_hand(detection.phrase) or not self.mask[frame].any():
             return False
-        rows = np.flatnonzero(self.mask[frame].any(axis=1))
-        columns = np.flatnonzero(self.mask[frame].any(axis=0))
-        box = (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)
-        return box_iou(box, detection.box_px) > min_overlap
+        return box_iou(mask_box(self.mask[frame]), detection.box_px) > min_overlap
 
 
 @dataclass(frozen=True)
@@ -93,11 +91,8 @@ class Grounded:
         return fingerprint((parameters, *(n.fingerprint() for n in self._networks)))
 
     def __call__(
-        self,
-        frames: UInt8[np.ndarray, "f h w 3"],
-        phrases: Sequence[str],
-        hands: HandTracks | None = None,
-    ) -> tuple[Int32[np.ndarray, "f h w"], Mapping[int, str]]:
+        self, frames: Video, phrases: Sequence[str], hands: HandTracks | None = None
+    ) -> tuple[IdMaps, Mapping[int, str]]:
         """Return instance ids and their names; ids of hands and arms are negative.
 
         Known hands are followed even if the detector misses them. Where tracks overlap, the higher
@@ -169,9 +164,7 @@ def _hand_detections(hands: HandTracks, frame: int, size: tuple[int, ...]) -> It
                 yield Detection(phrase="hand", score=float(presence), box_px=box)
 
 
-def _paint(
-    tracks: Sequence[_Track], shape: tuple[int, ...]
-) -> tuple[Int32[np.ndarray, "f h w"], dict[int, str]]:
+def _paint(tracks: Sequence[_Track], shape: tuple[int, ...]) -> tuple[IdMaps, dict[int, str]]:
     """Return ids and names of tracks, the best on top; ids of hands and arms are negative."""
     ids, names = np.zeros(shape, np.int32), {}
     for track in sorted(tracks, key=lambda track: track.score):

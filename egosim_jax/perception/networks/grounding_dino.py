@@ -11,11 +11,13 @@ from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from egosim_jax.perception.networks.checkpoint import Network, load_network
 from egosim_jax.perception.networks.worker import Run
+from egosim_jax.state.filter import box_iou
 from egosim_jax.types import InputError
+from egosim_jax.types.arrays import Video
 
 if TYPE_CHECKING:
     import torch
@@ -50,9 +52,7 @@ class GroundingDino(Network):
     max_overlap: float = 0.7
     """Maximum overlap (IoU) of two detections of a phrase; the lower score is dropped."""
 
-    def __call__(
-        self, frames: UInt8[np.ndarray, "f h w 3"], phrases: Sequence[str]
-    ) -> list[list[Detection]]:
+    def __call__(self, frames: Video, phrases: Sequence[str]) -> list[list[Detection]]:
         """Return the detections in each frame, best first."""
         phrases = clean_phrases(phrases)
         reply, _ = self.ask({"frames": frames}, phrases=phrases)
@@ -90,15 +90,6 @@ def clean_phrases(phrases: Sequence[str]) -> list[str]:
             f"must be at least one phrase, of at most {MAX_PHRASE}. Name the objects. (--phrases)"
         )
     return unique
-
-
-def box_iou(a: Sequence[float], b: Sequence[float]) -> float:
-    """Return the intersection over union of two boxes (first column and row, last ones)."""
-    width = max(0.0, min(a[2], b[2]) - max(a[0], b[0]))
-    height = max(0.0, min(a[3], b[3]) - max(a[1], b[1]))
-    areas = [(box[2] - box[0]) * (box[3] - box[1]) for box in (a, b)]
-    union = sum(areas) - width * height
-    return width * height / union if union > 0 else 0.0
 
 
 def load(folder: str, device: str, dtype: str) -> Run:

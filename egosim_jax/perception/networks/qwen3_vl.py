@@ -14,12 +14,12 @@ from dataclasses import KW_ONLY, dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import UInt8
 
 from egosim_jax.perception.networks.checkpoint import Network, load_network
 from egosim_jax.perception.networks.worker import NetworkError, Run
 from egosim_jax.state.filter import is_hand
 from egosim_jax.types import InputError
+from egosim_jax.types.arrays import Video
 
 MAX_CAPTION = 600
 """Maximum length of a caption in characters."""
@@ -54,14 +54,14 @@ class Qwen3VL(Network):
     prompt: str = PROMPT
     """Question; {count} is the number of frames."""
 
-    def __call__(self, frames: UInt8[np.ndarray, "f h w 3"]) -> tuple[str, tuple[str, ...]]:
+    def __call__(self, frames: Video) -> tuple[str, tuple[str, ...]]:
         """Return the caption and the names of moved objects.
 
         Raises `NetworkError` for a reply that has no caption.
         """
         return parse_reply(self.reply(frames))
 
-    def reply(self, frames: UInt8[np.ndarray, "f h w 3"]) -> str:
+    def reply(self, frames: Video) -> str:
         """Return the network's raw reply to the question about a video."""
         count = min(self.images, len(frames))
         chosen = np.linspace(0, len(frames) - 1, count).round().astype(int)

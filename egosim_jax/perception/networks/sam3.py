@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from jaxtyping import Int32, UInt8
 
 from egosim_jax.perception.networks.checkpoint import Network, load_network
 from egosim_jax.perception.networks.grounding_dino import clean_phrases
@@ -22,6 +21,7 @@ from egosim_jax.perception.networks.tracking import SAM3_PIXELS, new_session
 from egosim_jax.perception.networks.worker import Run
 from egosim_jax.perception.video.estimates import HandTracks
 from egosim_jax.state.filter import is_hand
+from egosim_jax.types.arrays import IdMaps, Video
 
 if TYPE_CHECKING:
     import torch
@@ -39,11 +39,8 @@ class Sam3(Network):
     files: ClassVar[tuple[str, ...]] = ("tokenizer_config.json",)
 
     def __call__(
-        self,
-        frames: UInt8[np.ndarray, "f h w 3"],
-        phrases: Sequence[str],
-        hands: HandTracks | None = None,
-    ) -> tuple[Int32[np.ndarray, "f h w"], Mapping[int, str]]:
+        self, frames: Video, phrases: Sequence[str], hands: HandTracks | None = None
+    ) -> tuple[IdMaps, Mapping[int, str]]:
         """Return instance ids and their names; ids of hands and arms are negative.
 
         Known hands are not used, because the network's prompts are phrases.

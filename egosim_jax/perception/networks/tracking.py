@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from jaxtyping import Int32, UInt8
 
 from egosim_jax.perception.networks.checkpoint import CONFIG, Network, load_network
 from egosim_jax.perception.networks.pixels import (
@@ -28,6 +27,7 @@ from egosim_jax.perception.networks.pixels import (
 )
 from egosim_jax.perception.networks.worker import Run
 from egosim_jax.types import InputError
+from egosim_jax.types.arrays import IdMaps, Video
 
 if TYPE_CHECKING:
     import torch
@@ -46,9 +46,7 @@ Box = tuple[float, float, float, float]
 class Tracker(Network):
     """Tracker of objects from their boxes in one frame."""
 
-    def __call__(
-        self, frames: UInt8[np.ndarray, "f h w 3"], frame: int, boxes_px: Sequence[Box]
-    ) -> Int32[np.ndarray, "f h w"]:
+    def __call__(self, frames: Video, frame: int, boxes_px: Sequence[Box]) -> IdMaps:
         """Return the box number (from 1) of each pixel's object; 0 for no object.
 
         The boxes contain the objects in one frame. The objects are tracked forward and backward

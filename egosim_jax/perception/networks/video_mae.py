@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 
 from egosim_jax.io.bounded import read_json
 from egosim_jax.perception.networks.checkpoint import Network, load_network
 from egosim_jax.perception.networks.pixels import normalize, resize_levels, to_images
 from egosim_jax.perception.networks.worker import Run
+from egosim_jax.types.arrays import Video
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Mean and standard deviation of ImageNet, for checkpoints without a processor file."""
@@ -32,7 +33,7 @@ class VideoMae(Network):
     needs: ClassVar[str] = "VideoMAE (MCG-NJU/videomae-*)"
     model_types: ClassVar[tuple[str, ...]] = ("videomae",)
 
-    def __call__(self, frames: UInt8[np.ndarray, "f h w 3"]) -> Float32[np.ndarray, " d"]:
+    def __call__(self, frames: Video) -> Float32[np.ndarray, " d"]:
         """Return the mean feature of the tubes of evenly spaced frames."""
         reply, _ = self.ask({"frames": frames})
         return reply["features"]

@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from PIL import Image
 
 from egosim_jax.io.bounded import read_json
 from egosim_jax.perception.networks.checkpoint import Network, load_network
 from egosim_jax.perception.networks.worker import Run
+from egosim_jax.types.arrays import Video
 
 PREPROCESSOR = "preprocessor_config.json"
 MEAN, STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
@@ -34,7 +35,7 @@ class XClip(Network):
     model_types: ClassVar[tuple[str, ...]] = ("xclip",)
     files: ClassVar[tuple[str, ...]] = (PREPROCESSOR, "tokenizer_config.json")
 
-    def __call__(self, video: UInt8[np.ndarray, "f h w 3"], text: str) -> float:
+    def __call__(self, video: Video, text: str) -> float:
         """Return the cosine similarity of a video and a text, from -1 to 1."""
         reply, _ = self.ask({"video": video}, text=text)
         return float(reply["similarity"])
@@ -70,7 +71,7 @@ def load(folder: str, device: str, dtype: str) -> Run:
 
 
 def prepare(
-    video: UInt8[np.ndarray, "f h w 3"], *, frames: int, size: int, mean: Any, std: Any
+    video: Video, *, frames: int, size: int, mean: Any, std: Any
 ) -> Float[np.ndarray, "n 3 {size} {size}"]:
     """Return evenly spaced frames of a video as the network's input: normalized center crops."""
     chosen = np.linspace(0, len(video) - 1, frames).round().astype(int)

@@ -19,6 +19,7 @@ from egosim_jax.rendering.reference import splat
 from egosim_jax.state.fuse import dilate
 from egosim_jax.state.new_objects import is_among
 from egosim_jax.types import Cameras, SceneState
+from egosim_jax.types.arrays import Colors
 
 FRAMES = 5
 """Number of compared frames, from the grasp to the end."""
@@ -55,10 +56,7 @@ Candidate = tuple[float, ObjectMotion]
 
 
 def choose_extent(
-    candidates: Sequence[Candidate],
-    growths: Sequence[ObjectModel],
-    film: Film,
-    state: SceneState,
+    candidates: Sequence[Candidate], growths: Sequence[ObjectModel], film: Film, state: SceneState
 ) -> int:
     """Return the index of the candidate whose part of a cluster explains the clip best.
 
@@ -100,10 +98,7 @@ def moving_part(motion: ObjectMotion, film: Film) -> ObjectModel:
 
 
 def predicted_costs(
-    motions: Sequence[ObjectMotion],
-    whole: ObjectModel,
-    film: Film,
-    state: SceneState,
+    motions: Sequence[ObjectMotion], whole: ObjectModel, film: Film, state: SceneState
 ) -> Float[np.ndarray, " m"] | None:
     """Return how far the scene that each motion predicts is from the clip, in 8-bit levels.
 
@@ -209,7 +204,7 @@ def _near(motions: Sequence[ObjectMotion], state: SceneState) -> Bool[np.ndarray
 
 
 def _ground_color(
-    motion: ObjectMotion, points_m: Float32[np.ndarray, "n 3"], colors: Float32[np.ndarray, "n 3"]
+    motion: ObjectMotion, points_m: Float32[np.ndarray, "n 3"], colors: Colors
 ) -> Float32[np.ndarray, " 3"]:
     """Return the color of the supporting plane; NaN without points on it."""
     plane = motion.model.plane

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from egosim_jax.geometry import invert, pixels_of, transform
 from egosim_jax.types import Cameras, SceneState
+from egosim_jax.types.arrays import Colors, Plane, Poses
 from egosim_jax.types.motion import ObjectPath
 
 
@@ -34,9 +35,7 @@ class ColorCost:
         light = np.clip((shown * expected).sum(axis=-1) / strength, self.min_light, self.max_light)
         return np.sqrt(np.square(shown - light[..., None] * expected).mean(axis=-1))
 
-    def mean(
-        self, shown: Float32[np.ndarray, "n 3"], expected: Float32[np.ndarray, "n 3"]
-    ) -> float:
+    def mean(self, shown: Colors, expected: Colors) -> float:
         """Return the mean color difference in 8-bit levels; an expected color of NaN is unknown."""
         gaps = self.apart(shown, expected)
         gaps = np.where(np.isnan(gaps), self.unknown_residual, gaps)
@@ -55,7 +54,7 @@ class ObjectModel:
     """Supporting plane a x + b y + c z + d = 0; its unit normal points up."""
 
     @classmethod
-    def of(cls, state: SceneState, number: int, plane: Float[np.ndarray, " 4"]) -> ObjectModel:
+    def of(cls, state: SceneState, number: int, plane: Plane) -> ObjectModel:
         """Return the model of a state's object."""
         chosen = state.object_ids == number
         return cls(
@@ -119,7 +118,7 @@ class Film:
         return replace(self, cameras=cameras, shown=self.shown[frames], hidden=self.hidden[frames])
 
     def residuals(
-        self, model: ObjectModel, path: Float[np.ndarray, "f 4 4"], *, every: int = 1
+        self, model: ObjectModel, path: Poses, *, every: int = 1
     ) -> Float[np.ndarray, "f n"]:
         """Return the color difference of each, or every n-th, point; NaN where it is not seen."""
         poses = invert(self.cameras.world_from_camera) @ path
@@ -130,6 +129,6 @@ class Film:
         return np.where(inside & ~self.hidden[frame, row, column], gaps, np.nan)
 
 
-def at_rest(count: int) -> Float[np.ndarray, "f 4 4"]:
+def at_rest(count: int) -> Poses:
     """Return the path of an object that does not move."""
     return np.repeat(np.eye(4)[None], count, axis=0)

@@ -19,6 +19,7 @@ from egosim_jax.geometry import upward
 from egosim_jax.perception.objects.film import ObjectModel
 from egosim_jax.state.planes import support_planes
 from egosim_jax.types import SceneState
+from egosim_jax.types.arrays import Points, Pose
 
 NOTHING = "closed on nothing"
 """Note of a hand that closes and has no points in its grip."""
@@ -81,7 +82,7 @@ class Surroundings:
         cls,
         state: SceneState,
         chosen: Int[np.ndarray, " k"],
-        world_from_camera: Float[np.ndarray, "4 4"],
+        world_from_camera: Pose,
         config: Growth,
     ) -> Surroundings:
         """Return the surroundings of a hand from the chosen points of a state."""
@@ -121,7 +122,7 @@ class Surroundings:
         return self.config.spacings * float(np.median(np.linalg.norm(gaps, axis=2)))
 
     @cached_property
-    def normals(self) -> Float[np.ndarray, "n 3"]:
+    def normals(self) -> Points:
         """Outward unit normals of the surfaces."""
         around = self.points_m[self.neighbors].astype(float)
         around -= around.mean(axis=1, keepdims=True)
@@ -354,10 +355,7 @@ class Surroundings:
 
 
 def clusters_without_id(
-    grips: Float[np.ndarray, "g 2 3"],
-    world_from_camera: Float[np.ndarray, "4 4"],
-    state: SceneState,
-    config: Growth,
+    grips: Float[np.ndarray, "g 2 3"], world_from_camera: Pose, state: SceneState, config: Growth
 ) -> tuple[list[list[ObjectModel]], str]:
     """Return the growths of each cluster without an id that a hand touches, and a note.
 
@@ -380,7 +378,7 @@ def clusters_without_id(
 
 
 def seeds_between(
-    points_m: Float[np.ndarray, "n 3"], tips_m: Float[np.ndarray, "2 3"], reach_m: float
+    points_m: Points, tips_m: Float[np.ndarray, "2 3"], reach_m: float
 ) -> Int[np.ndarray, " s"]:
     """Return the points nearest to the line from the thumb to the fingers, from its middle.
 

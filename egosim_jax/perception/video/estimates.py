@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from typing import Literal, Protocol, no_type_check, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32, UInt8
+from jaxtyping import Bool, Float, Float32, Int32
 
 from egosim_jax.types import Cameras
+from egosim_jax.types.arrays import IdMaps, Masks, Video
 
 LEFT, RIGHT = 0, 1
 """Index of a hand's side in `HandTracks`."""
@@ -134,7 +135,7 @@ class DepthEstimate:
 class HandEstimator(Protocol):
     """Estimator of the wearer's hands."""
 
-    def __call__(self, frames: UInt8[np.ndarray, "f h w 3"]) -> HandTracks:
+    def __call__(self, frames: Video) -> HandTracks:
         """Return the hands of a video."""
         ...
 
@@ -144,11 +145,7 @@ class CameraEstimator(Protocol):
     """Estimator of camera poses and intrinsics."""
 
     def __call__(
-        self,
-        frames: UInt8[np.ndarray, "f h w 3"],
-        moving: Bool[np.ndarray, "f h w"],
-        *,
-        focal_px: float | None = None,
+        self, frames: Video, moving: Masks, *, focal_px: float | None = None
     ) -> CameraEstimate:
         """Return the cameras of a video. Pixels in `moving` (hands, arms) are ignored."""
         ...
@@ -159,11 +156,7 @@ class DepthEstimator(Protocol):
     """Estimator of depth maps."""
 
     def __call__(
-        self,
-        frames: UInt8[np.ndarray, "f h w 3"],
-        moving: Bool[np.ndarray, "f h w"],
-        estimate: CameraEstimate,
-        wanted: Sequence[int],
+        self, frames: Video, moving: Masks, estimate: CameraEstimate, wanted: Sequence[int]
     ) -> DepthEstimate:
         """Return depth maps of the wanted frames, given estimated cameras."""
         ...
@@ -174,11 +167,8 @@ class Segmenter(Protocol):
     """Segmentation and tracking of objects named by phrases."""
 
     def __call__(
-        self,
-        frames: UInt8[np.ndarray, "f h w 3"],
-        phrases: Sequence[str],
-        hands: HandTracks | None = None,
-    ) -> tuple[Int32[np.ndarray, "f h w"], Mapping[int, str]]:
+        self, frames: Video, phrases: Sequence[str], hands: HandTracks | None = None
+    ) -> tuple[IdMaps, Mapping[int, str]]:
         """Return the id of each pixel (0: none, negative: hands and arms) and each id's name."""
         ...
 
@@ -187,6 +177,6 @@ class Segmenter(Protocol):
 class Captioner(Protocol):
     """Captioning of videos and naming of moved objects."""
 
-    def __call__(self, frames: UInt8[np.ndarray, "f h w 3"]) -> tuple[str, tuple[str, ...]]:
+    def __call__(self, frames: Video) -> tuple[str, tuple[str, ...]]:
         """Return the caption of a video and the names of its moved objects."""
         ...

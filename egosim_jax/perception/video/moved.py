@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int
 
 from egosim_jax.perception.video.cameras.flow import Background, background
 from egosim_jax.perception.video.estimates import HandTracks
@@ -27,6 +27,7 @@ from egosim_jax.perception.video.moved_pixels import (
     warp,
 )
 from egosim_jax.types import Cameras
+from egosim_jax.types.arrays import DepthMap, Mask, Masks, Video
 
 FOLLOWED_FPS = 10.0
 """Least rate of the frames in which corners are followed: with more steps, they drift."""
@@ -80,11 +81,11 @@ class _Tracks:
 
 
 def find_moved(
-    frames: UInt8[np.ndarray, "f h w 3"],
-    hidden: Bool[np.ndarray, "f h w"],
+    frames: Video,
+    hidden: Masks,
     hands: HandTracks,
     cameras: Cameras,
-    depth_m: Float[np.ndarray, "h w"],
+    depth_m: DepthMap,
     *,
     fps: float,
 ) -> list[Moved]:
@@ -120,11 +121,7 @@ def _in_all_frames(moved: Moved, keys: Int[np.ndarray, " k"], hands: HandTracks)
 
 
 def _find_moved(
-    frames: UInt8[np.ndarray, "f h w 3"],
-    hidden: Bool[np.ndarray, "f h w"],
-    hands: HandTracks,
-    cameras: Cameras,
-    depth_m: Float[np.ndarray, "h w"],
+    frames: Video, hidden: Masks, hands: HandTracks, cameras: Cameras, depth_m: DepthMap
 ) -> list[Moved]:
     video = background(frames, hidden)
     tracks = _follow(video, _corners(video, hands), cameras, depth_m)
@@ -179,10 +176,7 @@ def _corners(video: Background, hands: HandTracks) -> Float32[np.ndarray, "n 2"]
 
 
 def _follow(
-    video: Background,
-    start: Float32[np.ndarray, "n 2"],
-    cameras: Cameras,
-    depth_m: Float[np.ndarray, "h w"],
+    video: Background, start: Float32[np.ndarray, "n 2"], cameras: Cameras, depth_m: DepthMap
 ) -> _Tracks:
     """Track corners of the first frame from frame to frame."""
     pixels = (start + 0.5) * video.reduction - 0.5
@@ -359,7 +353,7 @@ def _contacts(
     return tuple(contacts)
 
 
-def _touches_border(mask: Bool[np.ndarray, "h w"]) -> bool:
+def _touches_border(mask: Mask) -> bool:
     edge = np.concatenate([mask[:3].ravel(), mask[-3:].ravel(), mask[:, :3].ravel(),
                            mask[:, -3:].ravel()])  # fmt: skip
     return bool(edge.any())

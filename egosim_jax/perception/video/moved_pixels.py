@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from egosim_jax.geometry import invert, project, transform
 from egosim_jax.types import Cameras
+from egosim_jax.types.arrays import Colors, DepthMap, Mask, Masks, RgbImage, Video
 
 WINDOW_PX = 21
 """Width of the border around hands that has no corners, because hands drag them along."""
@@ -46,13 +47,13 @@ BEYOND = 0.5
 
 
 def segment_moved(
-    frames: UInt8[np.ndarray, "f h w 3"],
-    hidden: Bool[np.ndarray, "f h w"],
+    frames: Video,
+    hidden: Masks,
     start: Float32[np.ndarray, "n 2"],
     motion: Float[np.ndarray, "f 2 3"],
     cameras: Cameras,
-    depth_m: Float[np.ndarray, "h w"],
-) -> Bool[np.ndarray, "h w"]:
+    depth_m: DepthMap,
+) -> Mask:
     """Return the pixels of the first frame that move with the corners rather than rest."""
     import cv2
 
@@ -106,7 +107,7 @@ def _searched(
 
 
 def resting_places(
-    pixels: Float[np.ndarray, "n 2"], cameras: Cameras, depth_m: Float[np.ndarray, "h w"]
+    pixels: Float[np.ndarray, "n 2"], cameras: Cameras, depth_m: DepthMap
 ) -> Float[np.ndarray, "f n 2"]:
     """Return where static points of the first frame are in each frame; NaN if unknown."""
     column, row = np.rint(pixels).astype(int).T
@@ -127,7 +128,7 @@ def move(motion: Float[np.ndarray, "2 3"], pixels: np.ndarray) -> np.ndarray:
     return pixels @ motion[:, :2].T + motion[:, 2]
 
 
-def warp(mask: Bool[np.ndarray, "h w"], motion: Float[np.ndarray, "2 3"]) -> np.ndarray:
+def warp(mask: Mask, motion: Float[np.ndarray, "2 3"]) -> np.ndarray:
     """Return a mask moved by an affine transform of the image."""
     import cv2
 
@@ -135,7 +136,7 @@ def warp(mask: Bool[np.ndarray, "h w"], motion: Float[np.ndarray, "2 3"]) -> np.
     return cv2.warpAffine(mask.astype(np.uint8), motion, size, flags=cv2.INTER_NEAREST) > 0
 
 
-def grown(mask: Bool[np.ndarray, "h w"], radius: int) -> Bool[np.ndarray, "h w"]:
+def grown(mask: Mask, radius: int) -> Mask:
     """Return a mask with a border around it; the radius is in pixels."""
     import cv2
 
@@ -172,9 +173,7 @@ def _compared(start: Float32[np.ndarray, "n 2"], motion: Float[np.ndarray, "f 2 
     return np.unique(np.concatenate(chosen)).tolist()
 
 
-def _change(
-    colors: Float32[np.ndarray, "n 3"], expected: Float32[np.ndarray, "n 3"]
-) -> Float32[np.ndarray, " n"]:
+def _change(colors: Colors, expected: Colors) -> Float32[np.ndarray, " n"]:
     """Return the changes of colors under the best light: shadows and exposure are no change."""
     light = (colors * expected).sum(axis=1) / np.maximum((colors**2).sum(axis=1), 1)
     light = np.clip(light, 1 / MAX_LIGHT, MAX_LIGHT)
@@ -192,9 +191,7 @@ def _medians(
     return np.where(count > 0, medians, np.float32(UNSEEN)), count > 0
 
 
-def _alike(
-    colors: Float32[np.ndarray, "n 3"], others: Float32[np.ndarray, "m 3"]
-) -> Bool[np.ndarray, " n"]:
+def _alike(colors: Colors, others: Float32[np.ndarray, "m 3"]) -> Bool[np.ndarray, " n"]:
     """Return the colors that are like one of some others."""
     from scipy.spatial import KDTree
 
@@ -205,9 +202,7 @@ def _alike(
 
 
 def _look_up(
-    image: UInt8[np.ndarray, "h w 3"],
-    hide: Bool[np.ndarray, "h w"],
-    places: Float[np.ndarray, "n 2"],
+    image: RgbImage, hide: Mask, places: Float[np.ndarray, "n 2"]
 ) -> tuple[Float32[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
     """Return the colors at places in an image, and True for places in view and not hidden."""
     height, width = hide.shape

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from egosim_jax.geometry import invert, pixel_rays, project, transform
 from egosim_jax.types import Cameras
+from egosim_jax.types.arrays import DepthMap, Mask, Masks, Points, RgbImage, Vector, Video
 
 Inpainter = Literal["patchmatch", "telea", "none"]
 """Inpainting method for the pixels that no frame shows."""
@@ -47,12 +48,12 @@ class CleanPlate:
 
 
 def clean_plate(
-    frames: UInt8[np.ndarray, "f h w 3"],
-    moving: Bool[np.ndarray, "f h w"],
+    frames: Video,
+    moving: Masks,
     cameras: Cameras,
-    depth_m: Float[np.ndarray, "h w"],
+    depth_m: DepthMap,
     *,
-    moved: Bool[np.ndarray, "f h w"] | None = None,
+    moved: Masks | None = None,
     margin_px: int = 3,
 ) -> CleanPlate:
     """Return the first frame with its `moving` pixels replaced by the scene behind them.
@@ -92,12 +93,8 @@ def clean_plate(
 
 
 def _look_up(
-    image: UInt8[np.ndarray, "h w 3"],
-    hide: Bool[np.ndarray, "h w"],
-    cameras: Cameras,
-    frame: int,
-    points: Float[np.ndarray, "n 3"],
-) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    image: RgbImage, hide: Mask, cameras: Cameras, frame: int, points: Points
+) -> tuple[Points, Bool[np.ndarray, " n"]]:
     """Return the colors of points in a frame, and True for those in view and not hidden."""
     import cv2
 
@@ -123,7 +120,7 @@ def _sample(image: np.ndarray, u: np.ndarray, v: np.ndarray, method: int) -> np.
     return values.reshape(-1, *image.shape[2:])[: values.shape[0] * width - missing]
 
 
-def _gain(here: np.ndarray, there: np.ndarray) -> Float[np.ndarray, " 3"]:
+def _gain(here: np.ndarray, there: np.ndarray) -> Vector:
     """Return the factor of each channel that equalizes the brightness of two views."""
     if len(here) < 50:
         return np.ones(3)
@@ -132,8 +129,8 @@ def _gain(here: np.ndarray, there: np.ndarray) -> Float[np.ndarray, " 3"]:
 
 
 def _agreement(
-    image: UInt8[np.ndarray, "h w 3"],
-    colors: Float[np.ndarray, "n 3"],
+    image: RgbImage,
+    colors: Points,
     rows: Int[np.ndarray, " n"],
     columns: Int[np.ndarray, " n"],
     border: Bool[np.ndarray, " n"],
@@ -155,11 +152,7 @@ def _agreement(
     return (alike / np.maximum(seen, 1e-9))[rows, columns].astype(float)
 
 
-def _inpaint(
-    image: UInt8[np.ndarray, "h w 3"],
-    missing: Bool[np.ndarray, "h w"],
-    excluded: Bool[np.ndarray, "h w"],
-) -> tuple[UInt8[np.ndarray, "h w 3"], Inpainter]:
+def _inpaint(image: RgbImage, missing: Mask, excluded: Mask) -> tuple[RgbImage, Inpainter]:
     """Return the inpainted image and the name of the method; `excluded` pixels are no source."""
     if not missing.any():
         return image, "none"

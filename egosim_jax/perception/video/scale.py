@@ -12,13 +12,14 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Int
 
 from egosim_jax.geometry import invert, pixel_rays, pixels_of, transform
 from egosim_jax.perception.video.estimates import CameraEstimate, DepthEstimate
 from egosim_jax.rendering.reference import splat
 from egosim_jax.state.planes import fit_plane
 from egosim_jax.types import Cameras, InputError
+from egosim_jax.types.arrays import DepthMap, DepthMaps, Masks
 
 Source = Literal["given", "cameras", "camera height", "metric depth", "hands", "median depth"]
 """Origin of a scale, from the most to the least certain."""
@@ -66,7 +67,7 @@ def estimate_scale(
     estimate: CameraEstimate,
     depth: DepthEstimate,
     joints_camera_m: Float[np.ndarray, "f n 21 3"] | None = None,
-    moving: Bool[np.ndarray, "f h w"] | None = None,
+    moving: Masks | None = None,
     *,
     meters_per_unit: float | None = None,
     camera_height_m: float | None = None,
@@ -121,7 +122,7 @@ def estimate_scale(
 
 def contact_scale(
     cameras: Cameras,
-    depth_m: Float[np.ndarray, "h w"],
+    depth_m: DepthMap,
     object_ids: Int[np.ndarray, "h w"],
     joints_camera_m: Float[np.ndarray, "f n 21 3"],
     contacts: Int[np.ndarray, "c 3"],
@@ -228,9 +229,7 @@ def _from_hands(
     )
 
 
-def _scene_depth(
-    cameras: Cameras, scene: DepthEstimate
-) -> tuple[Cameras, Float32[np.ndarray, "f h w"]]:
+def _scene_depth(cameras: Cameras, scene: DepthEstimate) -> tuple[Cameras, DepthMaps]:
     """Return downscaled cameras, and the depth of the static scene that each of them sees."""
     step = REDUCTION
     matrix = cameras.intrinsics_px.astype(float).copy()
@@ -266,26 +265,16 @@ def _from_height(cameras: Cameras, scene: DepthEstimate, height_m: float) -> Sca
     lower[: cameras.height // 2] = False
     points = (rays[lower] * first[lower][:, None])[:: max(1, lower.sum() // 20_000)]
     _require(len(points) >= 100, "the lower half of the first frame has no depth")
-    distance, share, spread = _plane_distance(points)
+    plane, inliers = fit_plane(points, 0.02 * float(np.median(points[:, 2])))
+    distance, share = abs(float(plane[3])), len(inliers) / len(points)
+    _require(distance > 0, "the plane in the lower half of the first frame meets the camera")
     return Scale(
         meters_per_unit=height_m / distance,
-        uncertainty=float(spread),
+        uncertainty=float(np.std(points[inliers] @ plane[:3]) / distance),
         source="camera height",
         reason=f"camera {height_m:g} m above the plane of {share:.0%} of the lower half of "
         f"frame {frame}",
     )
-
-
-def _plane_distance(points: Float[np.ndarray, "n 3"]) -> tuple[float, float, float]:
-    """Return the largest plane's distance from the origin, its inlier fraction, and its error.
-
-    The error is the standard deviation of the inliers, relative to the distance.
-    """
-    plane, inliers = fit_plane(points, 0.02 * float(np.median(points[:, 2])))
-    distance = abs(float(plane[3]))
-    _require(distance > 0, "the plane in the lower half of the first frame meets the camera")
-    deviation = np.std(points[inliers] @ plane[:3])
-    return distance, len(inliers) / len(points), float(deviation / distance)
 
 
 def _from_depth(scene: DepthEstimate, metric: DepthEstimate) -> Scale:
@@ -310,7 +299,7 @@ def _from_depth(scene: DepthEstimate, metric: DepthEstimate) -> Scale:
     )
 
 
-def _without(depth: DepthEstimate, moving: Bool[np.ndarray, "f h w"] | None) -> DepthEstimate:
+def _without(depth: DepthEstimate, moving: Masks | None) -> DepthEstimate:
     """Return depth without moving pixels."""
     if moving is None:
         return depth

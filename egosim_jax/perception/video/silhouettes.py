@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float, Int32, UInt8
+from jaxtyping import Float, UInt8
 
 from egosim_jax.dynamics.hands import PALM
 from egosim_jax.geometry import invert, project, transform
@@ -20,6 +20,7 @@ from egosim_jax.perception.video.estimates import HandTracks
 from egosim_jax.perception.video.hands import lift
 from egosim_jax.rendering.skeleton import SKELETONS
 from egosim_jax.types import Cameras, Counted, Kind
+from egosim_jax.types.arrays import IdMaps, Masks, Vector, Video
 
 ASSUMED_FOCAL = 0.45
 """Focal length for drawing tracks of an uncalibrated video, in image widths.
@@ -56,9 +57,7 @@ TRACKED = HandShape(forearm_m=0.26, sides_m=(-0.2, 0.2))
 """Size of the tracked hands of a video."""
 
 
-def track_silhouettes(
-    frames: UInt8[np.ndarray, "f h w 3"], tracks: HandTracks
-) -> Bool[np.ndarray, "f h w"]:
+def track_silhouettes(frames: Video, tracks: HandTracks) -> Masks:
     """Return the pixels of tracked hands and their forearms. Cameras need not be known.
 
     A hand that is missing from a frame covers nothing there.
@@ -78,7 +77,7 @@ def track_silhouettes(
 
 def hand_silhouette(
     joints_m: Float[np.ndarray, "f n j 3"], kind: Kind, cameras: Cameras, shape: HandShape
-) -> Int32[np.ndarray, "f h w"]:
+) -> IdMaps:
     """Return the index of the hand (forearm included) that covers each pixel; -1 for no hand.
 
     A hand with a joint that is not finite is not drawn.
@@ -109,9 +108,7 @@ def hand_silhouette(
     return covered
 
 
-def _arm(
-    palm: Float[np.ndarray, "k 3"], number: int, shape: HandShape
-) -> list[Float[np.ndarray, " 3"]]:
+def _arm(palm: Float[np.ndarray, "k 3"], number: int, shape: HandShape) -> list[Vector]:
     """Return the points of an arm in camera axes: wrist, elbow if it has one, and its end."""
     arm = [palm[0]]
     sides = shape.sides_m
@@ -123,14 +120,14 @@ def _arm(
     return [*arm, arm[-1] + shape.arm_fraction * (origin - arm[-1])]
 
 
-def _unit(vector: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+def _unit(vector: Vector) -> Vector:
     return vector / max(float(np.linalg.norm(vector)), 1e-9)
 
 
 def draw_capsule(
     canvas: UInt8[np.ndarray, "h w"],
-    start: Float[np.ndarray, " 3"],
-    end: Float[np.ndarray, " 3"],
+    start: Vector,
+    end: Vector,
     radius_m: float,
     cameras: Cameras,
     shape: HandShape,

@@ -9,7 +9,7 @@ import numpy as np
 from egosim_jax.annotate.config import AnnotateConfig, Estimators
 from egosim_jax.io.writing import write_video
 from egosim_jax.perception.video.estimates import CameraEstimate, DepthEstimate, HandTracks, Verdict
-from egosim_jax.types import Cameras
+from tests.scenes import pinhole
 
 FOCAL = 50.0
 DEPTH = 2.0
@@ -64,13 +64,7 @@ class StubCameras:
             verdict = Verdict(rung="refused", reason="nothing to see", figures={"registered": 0.1})
             return CameraEstimate(cameras=None, metric=False, verdict=verdict)
         focal = FOCAL if focal_px is None else focal_px
-        center = (width - 1) / 2, (height - 1) / 2
-        cameras = Cameras(
-            world_from_camera=np.tile(np.eye(4), (count, 1, 1)),
-            intrinsics_px=np.array([[focal, 0, center[0]], [0, focal, center[1]], [0, 0, 1]]),
-            height=height,
-            width=width,
-        )
+        cameras = pinhole(count, focal, height, width)
         rung = "incremental" if self.refuse_dark else "static"
         verdict = Verdict(rung=rung, reason="still", figures={"still": 1.0})
         return CameraEstimate(cameras=cameras, metric=False, verdict=verdict)

@@ -18,6 +18,13 @@ FULL_HD = Recording(
 )
 
 
+def recorded(folder, frames, fps=16):
+    """Write a video and return its recording."""
+    count, height, width, _ = frames.shape
+    path = write(folder / "a.mp4", frames, fps)
+    return replace(FULL_HD, video=path, frames=count, fps=Fraction(fps), height=height, width=width)
+
+
 def test_the_size_of_a_video_is_kept_up_to_832_pixels():
     fitted = plan(FULL_HD, Sampling(), cut=False)
     assert (fitted.height, fitted.width, fitted.fps, fitted.count) == (464, 832, 30, 278)
@@ -78,10 +85,7 @@ def test_intrinsics_follow_resizing_and_cropping():
 
 def test_frames_are_read_at_the_rate_of_the_clip(tmp_path):
     frames = np.repeat(np.arange(0, 250, 10, np.uint8), 48 * 80 * 3).reshape(25, 48, 80, 3)
-    path = write(tmp_path / "a.mp4", frames, 24)
-    recording = Recording(
-        recording_id="a", video=path, frames=25, fps=Fraction(24), height=48, width=80
-    )
+    recording = recorded(tmp_path, frames, 24)
     fitted = plan(recording, Sampling(fps=8.0), cut=False)
     found = read_frames(recording, fitted, 0, fitted.count)
     assert np.abs(found.mean(axis=(1, 2, 3)) - np.arange(0, 250, 30)).max() < 3
@@ -89,10 +93,7 @@ def test_frames_are_read_at_the_rate_of_the_clip(tmp_path):
 
 def test_frames_are_cropped_in_the_middle(tmp_path):
     video = textured_video(9, 60, 90)
-    path = write(tmp_path / "a.mp4", video)
-    recording = Recording(
-        recording_id="a", video=path, frames=9, fps=Fraction(16), height=60, width=90
-    )
+    recording = recorded(tmp_path, video)
     fitted = plan(recording, Sampling(), cut=False)
     assert (fitted.height, fitted.width) == (48, 80)
     assert fitted.scale == pytest.approx(80 / 90)
@@ -115,10 +116,7 @@ def test_pixels_of_the_video_are_where_the_frame_is_resized_and_cropped(size):
 
 def test_hands_are_searched_in_the_frames_of_the_video(tmp_path):
     video = textured_video(9, 60, 90)
-    path = write(tmp_path / "a.mp4", video)
-    recording = Recording(
-        recording_id="a", video=path, frames=9, fps=Fraction(16), height=60, width=90
-    )
+    recording = recorded(tmp_path, video)
     smaller = plan(recording, Sampling(size=(32, 48)), cut=False)
     found = read_searched_frames(recording, np.array([1, 4]), smaller)
     assert found is not None

@@ -294,16 +294,6 @@ def test_a_clip_without_cameras_is_tried_with_the_focal_length_of_its_video(tmp_
     assert run.choose_retries(scanned, out) == []
 
 
-def test_long_videos_are_cut_into_clips(tmp_path):
-    frames = np.concatenate([textured_video(20), textured_video(20, seed=1) // 2])
-    path = write(tmp_path / "long.mp4", frames)
-    settings = config(sampling=Sampling(num_frames=9), cutting=Cutting(clips=True))
-    report = annotate([path], tmp_path / "out", settings)
-    assert [about["start"] for about in report["annotations"]] == [0, 9, 20, 29]
-    (first, *_) = read_metadata(tmp_path / "out/metadata.csv")
-    assert first.video_id == "long_0_8"
-
-
 def test_killed_runs_continue(video, tmp_path):
     """After a process is killed, the same command gives the result of one run."""
     write(tmp_path / "dish.mp4", textured_video(17, seed=3))

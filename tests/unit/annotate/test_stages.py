@@ -25,14 +25,18 @@ from egosim_jax.perception.video.moved import Moved
 from tests.unit.annotate.stubs import StubHands, config, textured_video, write
 
 
+def record_of(tmp_path, settings, frames):
+    """Return the record of a clip of nine frames, before all stages."""
+    path = write(tmp_path / "cup.mp4", frames)
+    open_source(Source(name="cup", path=path)).save(tmp_path / "cup")
+    job = Job(video_id="cup", recording=str(tmp_path / "cup"), start=0, stop=9, figures={})
+    return open_record(job, settings)
+
+
 def stages_of(tmp_path, settings, *, last="caption"):
     """Return the record of a video of a fixed camera after a stage."""
-    recording = open_source(Source(name="cup", path=write(tmp_path / "cup.mp4", np.repeat(
-        textured_video(1), 9, axis=0
-    ))))  # fmt: skip
-    recording.save(tmp_path / "cup")
-    job = Job(video_id="cup", recording=str(tmp_path / "cup"), start=0, stop=9, figures={})
-    record, parts = open_record(job, settings), settings.build()
+    record = record_of(tmp_path, settings, np.repeat(textured_video(1), 9, axis=0))
+    parts = settings.build()
     for stage in STAGES:
         record = stage.run(record, parts, settings)
         if stage.name == last:
@@ -197,13 +201,8 @@ def test_a_second_hand_on_the_first_one_is_dropped_unless_it_lasts(count, aside,
 
 
 def test_hands_outside_of_the_crop_are_missing_and_others_in_pixels_of_the_clip(tmp_path):
-    recording = open_source(Source(name="cup", path=write(
-        tmp_path / "cup.mp4", textured_video(9, 96, 160)
-    )))  # fmt: skip
-    recording.save(tmp_path / "cup")
     settings = config(sampling=Sampling(size=(48, 64)))
-    job = Job(video_id="cup", recording=str(tmp_path / "cup"), start=0, stop=9, figures={})
-    record, parts = open_record(job, settings), settings.build()
+    record, parts = record_of(tmp_path, settings, textured_video(9, 96, 160)), settings.build()
     found = search_hands(record, parts)
     searched = parts.hands(np.zeros((9, 96, 160, 3), np.uint8))
     half = (searched.joints_px + 0.5) / 2 - 0.5 - [8, 0]  # 80 x 48, cropped to 64 columns

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from egosim_jax.dynamics import Prediction
 from egosim_jax.dynamics.level import level_scene
 from egosim_jax.geometry import look_at
-from egosim_jax.types import Action, Cameras, SceneState
+from egosim_jax.types import Action
+from tests.scenes import pinhole, state_of
 
 FRAMES = 17
-CAMERAS = Cameras(
-    world_from_camera=np.repeat(
-        look_at(np.array([0, -0.5, 0.5]), np.zeros(3), up=np.array([0, 0, 1.0]))[None], FRAMES, 0
-    ),
-    intrinsics_px=np.array([[120.0, 0, 79.5], [0, 120, 47.5], [0, 0, 1]]),
-    height=96,
-    width=160,
-)
+CAMERA = look_at(np.array([0, -0.5, 0.5]), np.zeros(3), up=np.array([0, 0, 1.0]))
+CAMERAS = pinhole([CAMERA] * FRAMES, 120.0, 96, 160)
 SIDE = np.arange(-0.4, 0.4, 0.01)
 TABLE = np.stack(np.meshgrid(SIDE, SIDE, [0.0]), axis=-1).reshape(-1, 3)
 EDGE = np.linspace(-1, 1, 9)
@@ -28,16 +25,9 @@ CUBE, BLOCK = 0.02 * BOX, 0.05 * BOX + [0.25, 0, 0]
 
 def make_state(**fields):
     """Return a state of a small cube, a large block and a table."""
-    points = np.concatenate([TABLE, CUBE, BLOCK]).astype(np.float32)
-    return SceneState(
-        points_m=points,
-        colors=np.zeros((len(points), 3), np.uint8),
-        object_ids=np.repeat(np.arange(3, dtype=np.int32), [len(TABLE), len(CUBE), len(BLOCK)]),
-        last_seen=np.zeros(len(points), np.int32),
-        intrinsics_px=CAMERAS.intrinsics_px,
-        provenance={"world": "tabletop"},
-        **fields,
-    )
+    parts = [TABLE, CUBE, BLOCK]
+    ids = np.repeat(np.arange(3), [len(part) for part in parts])
+    return state_of(np.concatenate(parts), ids=ids, provenance={"world": "tabletop"}, **fields)
 
 
 def make_action(end_m, released):
@@ -87,7 +77,7 @@ def test_an_object_in_a_hand_has_the_support_that_it_was_taken_from():
     state = make_state(world_from_object={1: pose}, held={0: 1})
     points = state.points_m.copy()
     points[state.object_ids == 1] += pose[:3, 3].astype(np.float32)
-    state = SceneState(**{**vars(state), "points_m": points})
+    state = replace(state, points_m=points)
     eye = CAMERAS.world_from_camera[0]
     scene = level_scene(state, eye, eye[None, :3, 3], reach_m=np.inf)
     assert scene.solids[1].lifted_m == pytest.approx(0.15)

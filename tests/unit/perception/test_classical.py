@@ -26,9 +26,15 @@ def clip(request):
     return next(make_sequence(request.param, spec=SPEC))
 
 
+def perceive(clip, *, frames=None, action=None, state=None):
+    """Perceive a clip, or other frames of it, by its action or another one, in its state."""
+    shown = Clip(frames=clip.frames if frames is None else frames, fps=8)
+    return ClassicalConfig().build()(shown, action or to_action(clip), state or clip.state)
+
+
 @pytest.fixture(scope="module")
 def found(clip):
-    return ClassicalConfig().build()(Clip(frames=clip.frames, fps=8), to_action(clip), clip.state)
+    return perceive(clip)
 
 
 def seen_before(clip):
@@ -57,11 +63,7 @@ def test_its_points_end_within_a_centimeter_of_where_it_is(clip, found):
 @pytest.mark.parametrize("sigma_px", [2.0, 3.0])
 def test_a_blurred_object_ends_where_the_hand_put_it(clip, sigma_px):
     blurred = np.stack([cv2.GaussianBlur(frame, (0, 0), sigma_px) for frame in clip.frames])
-    found = (
-        ClassicalConfig()
-        .build()(Clip(frames=blurred, fps=8), to_action(clip), clip.state)
-        .world_from_object[clip.body_ids[clip.target]]
-    )
+    found = perceive(clip, frames=blurred).world_from_object[clip.body_ids[clip.target]]
     true = clip.world_from_body[clip.target]
     gap = (found[-1] @ invert(found[0]) - true[-1] @ invert(true[0])) @ true[0][:, 3]
     assert np.linalg.norm(gap) < 0.01
@@ -70,8 +72,7 @@ def test_a_blurred_object_ends_where_the_hand_put_it(clip, sigma_px):
 @pytest.fixture(scope="module")
 def found_without_ids(clip):
     bare = without_ids(clip.state)
-    found = ClassicalConfig().build()(Clip(frames=clip.frames, fps=8), to_action(clip), bare)
-    return bare, found
+    return bare, perceive(clip, state=bare)
 
 
 def test_an_object_without_an_id_is_found_and_moved(clip, found_without_ids):
@@ -92,8 +93,7 @@ def test_an_object_without_an_id_is_found_and_moved(clip, found_without_ids):
 
 
 def test_in_the_next_clip_the_object_keeps_its_id(clip, found_without_ids):
-    after = fuse(*found_without_ids)
-    again = ClassicalConfig().build()(Clip(frames=clip.frames, fps=8), to_action(clip), after)
+    again = perceive(clip, state=fuse(*found_without_ids))
     assert again.new_objects == {}
     assert set(again.world_from_object) <= {1}
 
@@ -126,25 +126,25 @@ def test_the_silhouettes_cover_the_hands(clip):
 
 
 def without_motion(clip):
-    """Return a clip of the state at rest, and its action, from a camera that does not move."""
+    """Return frames of the state at rest, and the action, from a camera that does not move."""
     still = np.repeat(clip.first.colors[None], SPEC.frames, axis=0)
     poses = np.repeat(clip.cameras.world_from_camera[:1], SPEC.frames, axis=0)
     cameras = replace(clip.cameras, world_from_camera=poses)
-    return Clip(frames=still, fps=8), replace(to_action(clip), cameras=cameras)
+    return {"frames": still, "action": replace(to_action(clip), cameras=cameras)}
 
 
 def test_a_clip_without_motion_changes_nothing(clip):
     """The hand moves 15 cm above its path, where it holds nothing."""
-    still, action = without_motion(clip)
-    above = replace(action, joints_m=action.joints_m + np.float32([0, 0, 0.15]))
-    found = ClassicalConfig().build()(still, above, clip.state)
+    still = without_motion(clip)
+    joints = still["action"].joints_m + np.float32([0, 0, 0.15])
+    found = perceive(clip, **still | {"action": replace(still["action"], joints_m=joints)})
     assert not found.world_from_object
     after = fuse(clip.state, found)
     assert len(after.points_m) == len(clip.state.points_m)
 
 
 def test_a_clip_that_leaves_an_object_at_rest_does_not_overrule_a_firm_grip(clip):
-    found = ClassicalConfig().build()(*without_motion(clip), clip.state)
+    found = perceive(clip, **without_motion(clip))
     target = clip.body_ids[clip.target]
     assert set(found.world_from_object) == {target}
     last, true = found.world_from_object[target][-1], clip.world_from_body[clip.target]
@@ -159,14 +159,14 @@ def test_noise_of_a_video_does_not_hide_what_a_hand_carries(clip, found):
     action, rng = to_action(clip), np.random.default_rng(0)
     noise = rng.normal(0, 0.004, action.joints_m.shape)
     shaken = replace(action, joints_m=(action.joints_m + noise).astype(action.joints_m.dtype))
-    seen = ClassicalConfig().build()(Clip(frames=clip.frames, fps=8), shaken, clip.state)
+    seen = perceive(clip, action=shaken)
     assert set(seen.world_from_object) == {clip.body_ids[clip.target]}
 
 
 def test_without_hands_nothing_is_found(clip):
     action = to_action(clip)
     missing = replace(action, joints_m=np.full_like(action.joints_m, np.nan))
-    found = ClassicalConfig().build()(Clip(frames=clip.frames, fps=8), missing, clip.state)
+    found = perceive(clip, action=missing)
     assert not found.world_from_object
     assert not np.isfinite(found.depth_m[seen_before(clip)]).any()
 
@@ -185,7 +185,7 @@ def test_only_one_of_two_hands_on_an_object_moves_it(clip, found):
     action = to_action(clip)
     second = action.joints_m + [0.004, 0, 0]
     both = replace(action, joints_m=np.concatenate([second, action.joints_m], axis=1))
-    twice = ClassicalConfig().build()(Clip(frames=clip.frames, fps=8), both, clip.state)
+    twice = perceive(clip, action=both)
     assert twice.world_from_object.keys() == found.world_from_object.keys()
     target = clip.body_ids[clip.target]
     points = clip.state.points_m[clip.state.object_ids == target].astype(float).mean(axis=0)
@@ -208,11 +208,7 @@ def test_furniture_is_found_open_or_shut(kind, seed, number, verb, shape):
     target = clip.body_ids[clip.target]
     assert clip.verb == verb
     assert clip.state.names[target].endswith(shape)
-    found = (
-        ClassicalConfig()
-        .build()(Clip(frames=clip.frames, fps=8), to_action(clip), clip.state)
-        .world_from_object
-    )
+    found = perceive(clip).world_from_object
     path = clip.world_from_body[clip.target]
     points = clip.state.points_m[clip.state.object_ids == target].astype(float)
     there = transform(path[-1] @ invert(path[0]), points)
@@ -227,5 +223,5 @@ def test_in_uniform_frames_the_grip_decides(clip, aside_m, moved):
     gray = np.full_like(clip.frames, 127)
     action = to_action(clip)
     action = replace(action, joints_m=action.joints_m + np.array([0, 0, aside_m]), prompt="")
-    found = ClassicalConfig().build()(Clip(frames=gray, fps=8), action, clip.state)
+    found = perceive(clip, frames=gray, action=action)
     assert set(found.world_from_object) == ({clip.body_ids[clip.target]} if moved else set())

@@ -6,32 +6,18 @@ import numpy as np
 import pytest
 
 from egosim_jax.perception.pipeline import Observation, Pipeline, find_interactions
-from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState
+from egosim_jax.types import Clip, InputError
+from tests.scenes import pinhole, state_of, without_hands
 
 SIZE = (3, 8, 10)
-CAMERAS = Cameras(
-    world_from_camera=np.tile(np.eye(4), (SIZE[0], 1, 1)),
-    intrinsics_px=np.array([[9.0, 0, 4.5], [0, 9, 3.5], [0, 0, 1]]),
-    height=SIZE[1],
-    width=SIZE[2],
-)
+CAMERAS = pinhole(SIZE[0], 9.0, *SIZE[1:])
 POSE = np.diag([-1.0, -1, 1, 1])
 
 
 def asked():
-    joints = np.full((SIZE[0], 1, 21, 3), np.nan)
-    state = SceneState(
-        points_m=np.zeros((1, 3), np.float32),
-        colors=np.zeros((1, 3), np.uint8),
-        object_ids=np.zeros(1, np.int32),
-        last_seen=np.zeros(1, np.int32),
-        intrinsics_px=CAMERAS.intrinsics_px,
-        step=4,
-        names={1: "cup in hand"},
-        world_from_object={1: POSE},
-    )
-    action = Action(cameras=CAMERAS, joints_m=joints, kind="human", prompt="")
-    return Clip(frames=np.zeros((*SIZE, 3), np.uint8), fps=8), action, state
+    poses, names = {1: POSE}, {1: "cup in hand"}
+    state = state_of(np.zeros((1, 3)), step=4, names=names, world_from_object=poses)
+    return Clip(frames=np.zeros((*SIZE, 3), np.uint8), fps=8), without_hands(CAMERAS), state
 
 
 def poses(clip, action, state, so_far):

@@ -13,16 +13,19 @@ from egosim_jax.geometry import look_at, transform
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.perception import recorded
 from egosim_jax.perception.recorded import IDS_PER_STEP, RecordedConfig
-from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState
+from egosim_jax.types import Clip, InputError
 from tests.fuzz.mutations import BYTES
+from tests.scenes import pinhole, state_of, without_hands
 
 FRAMES, HEIGHT, WIDTH = 5, 6, 8
-INTRINSICS = np.array([[9.0, 0, 3.5], [0, 9, 2.5], [0, 0, 1]])
 
 
 def path():
     eyes = [np.array([0.1 * k, -0.4, 0.5 + 0.02 * k**2]) for k in range(FRAMES)]
     return np.stack([look_at(eye, np.zeros(3), up=np.array([0, 0, 1.0])) for eye in eyes])
+
+
+CAMERAS = pinhole(path(), 9.0, HEIGHT, WIDTH)
 
 
 def motion(scale=1.0):
@@ -32,22 +35,8 @@ def motion(scale=1.0):
 
 
 def asked(step=0):
-    cameras = Cameras(
-        world_from_camera=path(), intrinsics_px=INTRINSICS, height=HEIGHT, width=WIDTH
-    )
-    action = Action(
-        cameras=cameras, joints_m=np.full((FRAMES, 1, 21, 3), np.nan), kind="human", prompt=""
-    )
-    state = SceneState(
-        points_m=np.zeros((1, 3), np.float32),
-        colors=np.zeros((1, 3), np.uint8),
-        object_ids=np.zeros(1, np.int32),
-        last_seen=np.zeros(1, np.int32),
-        intrinsics_px=INTRINSICS,
-        step=step,
-    )
-    frames = np.zeros((FRAMES, HEIGHT, WIDTH, 3), np.uint8)
-    return Clip(frames=frames, fps=8), action, state
+    clip = Clip(frames=np.zeros((FRAMES, HEIGHT, WIDTH, 3), np.uint8), fps=8)
+    return clip, without_hands(CAMERAS), state_of(np.zeros((1, 3)), step=step)
 
 
 def write(folder: Path, *, scale=1.0, frames=FRAMES, depth=0.5):
@@ -82,7 +71,7 @@ def test_cameras_and_depth_come_into_the_world(tmp_path, alignment, scale):
     write(tmp_path, scale=scale)
     found = RecordedConfig(folder=tmp_path, name="clip", alignment=alignment).build()(*asked())
     np.testing.assert_allclose(found.cameras.world_from_camera, path(), atol=1e-9)
-    np.testing.assert_allclose(found.cameras.intrinsics_px, INTRINSICS)
+    np.testing.assert_allclose(found.cameras.intrinsics_px, CAMERAS.intrinsics_px)
     assert np.isinf(found.depth_m[:, 0, :2]).all()
     np.testing.assert_allclose(found.depth_m[:, 1:], 0.5, rtol=1e-3)
 

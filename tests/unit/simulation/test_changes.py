@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from egosim_jax.simulation.changes import moved_objects
 from egosim_jax.types import SceneState
+from tests.scenes import state_of
 from tests.unit.perception.clip.test_object_motion import FRAMES, carry, film, gripper, make_state
 from tests.unit.perception.clip.test_object_motion import track as observe
 
@@ -18,15 +19,7 @@ def scene() -> SceneState:
     """A table and two objects."""
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.uniform(-1, 1, (40, 3)), CENTER + rng.normal(0, 0.02, (60, 3))])
-    points = points.astype(np.float32)
-    return SceneState(
-        points_m=points,
-        colors=np.zeros((100, 3), np.uint8),
-        object_ids=np.repeat(np.array([0, 1, 2], np.int32), [20, 20, 60]),
-        last_seen=np.zeros(100, np.int32),
-        intrinsics_px=np.eye(3),
-        names={1: "green cone"},
-    )
+    return state_of(points, ids=np.repeat([0, 1, 2], [20, 20, 60]), names={1: "green cone"})
 
 
 def moved(state: SceneState, number: int, pose: np.ndarray) -> SceneState:

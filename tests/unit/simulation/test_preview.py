@@ -10,22 +10,15 @@ from egosim_jax.rendering.reference import draw_hands
 from egosim_jax.simulation.preview import Preview, mesh_of
 from egosim_jax.simulation.simulator import Simulator
 from egosim_jax.state.depth import state_from_depth
-from egosim_jax.types import Action, Cameras, VideoSpec, View
+from egosim_jax.types import Action, VideoSpec, View
+from tests.scenes import pinhole
 
 GRAY = 128
 SPEC = VideoSpec(frames=6, height=48, width=80, fps=8)
 
 
 def cameras(spec=SPEC):
-    focal = float(spec.width)
-    return Cameras(
-        world_from_camera=np.repeat(np.eye(4)[None], spec.frames, axis=0),
-        intrinsics_px=np.array(
-            [[focal, 0, (spec.width - 1) / 2], [0, focal, (spec.height - 1) / 2], [0, 0, 1]]
-        ),
-        height=spec.height,
-        width=spec.width,
-    )
+    return pinhole(spec.frames, float(spec.width), spec.height, spec.width)
 
 
 def action(kind="human", spec=SPEC, side=1.0):

@@ -6,7 +6,8 @@ import pytest
 from egosim_jax.geometry import look_at, pixel_rays
 from egosim_jax.rendering.reference import render
 from egosim_jax.state.depth import state_from_depth
-from egosim_jax.types import Cameras, InputError
+from egosim_jax.types import InputError
+from tests.scenes import pinhole
 
 INTRINSICS = np.array([[40.0, 0, 19.5], [0, 40.0, 11.5], [0, 0, 1]])
 POSE = look_at(np.array([0.1, -1.0, 0.4]), np.zeros(3), up=np.array([0, 0, 1.0]))
@@ -24,7 +25,7 @@ def test_the_state_seen_from_its_camera_is_the_image():
     image, depth_m = image_and_depth()
     ids = np.arange(24 * 40).reshape(24, 40) % 7
     state = state_from_depth(image, depth_m, INTRINSICS, POSE, object_ids=ids, names={1: "cup"})
-    cameras = Cameras(world_from_camera=POSE[None], intrinsics_px=INTRINSICS, height=24, width=40)
+    cameras = pinhole(POSE[None], 40.0, 24, 40)
     view = render(state, cameras, point_px=1)
     known = np.isfinite(depth_m) & (depth_m > 0)
     np.testing.assert_array_equal(view.frames[0][known], image[known])
@@ -48,7 +49,7 @@ def test_split_pixels_lie_on_the_same_plane_and_leave_no_gaps_nearby():
     assert inner.max() < 0.03
     near = np.eye(4)
     near[2, 3] = 0.4
-    cameras = Cameras(world_from_camera=near[None], intrinsics_px=INTRINSICS, height=24, width=40)
+    cameras = pinhole(near[None], 40.0, 24, 40)
     assert np.isfinite(render(state, cameras, point_px=1).depth_m[0, 8:16, 10:16]).all()
 
 

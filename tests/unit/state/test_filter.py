@@ -102,5 +102,5 @@ def test_one_invisible_frame_is_not_a_disappearance():
 
 
 def test_box_iou_is_intersection_over_union():
-    assert box_iou((0, 4, 0, 4), (2, 6, 0, 4)) == pytest.approx(8 / 24)
-    assert box_iou((0, 4, 0, 4), (4, 6, 0, 4)) == 0
+    assert box_iou((0, 0, 4, 4), (0, 2, 4, 6)) == pytest.approx(8 / 24)
+    assert box_iou((0, 0, 4, 4), (0, 4, 4, 6)) == 0

@@ -5,7 +5,7 @@ import pytest
 
 from egosim_jax.geometry import invert, look_at, transform
 from egosim_jax.state.planes import fit_plane, support_planes, vertical
-from egosim_jax.types import SceneState
+from tests.scenes import state_of
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -63,15 +63,7 @@ def test_a_plane_has_its_inliers(room):
 
 
 def scene(points_m, **provenance):
-    count = len(points_m)
-    return SceneState(
-        points_m=points_m.astype(np.float32),
-        colors=np.zeros((count, 3), np.uint8),
-        object_ids=np.zeros(count, np.int32),
-        last_seen=np.zeros(count, np.int32),
-        intrinsics_px=np.eye(3),
-        provenance=provenance,
-    )
+    return state_of(points_m, provenance=provenance)
 
 
 @pytest.mark.parametrize("eye", [[0, -0.5, 1.6], [0.3, -0.4, 2.0], [-0.8, 0.3, 1.2]])

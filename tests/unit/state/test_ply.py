@@ -10,7 +10,7 @@ import pytest
 from egosim_jax.cli.view import View
 from egosim_jax.state.ply import MAX_HEADER, read_points, read_triangles
 from egosim_jax.state.snapshot import read_ply, write_ply
-from egosim_jax.types import InputError, SceneState
+from egosim_jax.types import InputError
 
 PROPERTIES = [("float", c) for c in "xyz"] + [("uchar", c) for c in ("red", "green", "blue")]
 
@@ -185,16 +185,3 @@ def test_a_pipe_is_refused_without_waiting_for_it(tmp_path):
     os.mkfifo(tmp_path / "pipe.ply")
     with pytest.raises(InputError, match="not a regular file"):
         read_points(tmp_path / "pipe.ply")
-
-
-def test_colors_of_a_state_survive(tmp_path):
-    state = SceneState(
-        points_m=np.ones((1, 3), np.float32),
-        colors=np.array([[1, 2, 3]], np.uint8),
-        object_ids=np.array([7], np.int32),
-        last_seen=np.array([9], np.int32),
-        intrinsics_px=np.eye(3),
-    )
-    write_ply(tmp_path / "a.ply", state)
-    again = read_ply(tmp_path / "a.ply")
-    assert (again.object_ids, again.last_seen) == ([7], [9])

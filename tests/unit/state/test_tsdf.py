@@ -9,7 +9,8 @@ from scipy.spatial import cKDTree
 
 from egosim_jax.geometry import look_at, pixel_rays
 from egosim_jax.state.tsdf import Fusion, surface, valid_depth_mask
-from egosim_jax.types import Cameras, InputError
+from egosim_jax.types import InputError
+from tests.scenes import pinhole
 
 HEIGHT, WIDTH = 120, 200
 UP = np.array([0.0, 0.0, 1.0])
@@ -18,15 +19,8 @@ UP = np.array([0.0, 0.0, 1.0])
 def cameras(count=9):
     turns = np.linspace(0, 2 * np.pi, count)
     eyes = [np.array([0.1 * np.sin(a), -0.12 + 0.05 * np.cos(a), 0.46]) for a in turns]
-    focal = 150.0
-    return Cameras(
-        world_from_camera=np.stack([look_at(e, np.array([0.01, 0.28, 0.03]), up=UP) for e in eyes]),
-        intrinsics_px=np.array(
-            [[focal, 0, (WIDTH - 1) / 2], [0, focal, (HEIGHT - 1) / 2], [0, 0, 1]]
-        ),
-        height=HEIGHT,
-        width=WIDTH,
-    )
+    poses = [look_at(e, np.array([0.01, 0.28, 0.03]), up=UP) for e in eyes]
+    return pinhole(poses, 150.0, HEIGHT, WIDTH)
 
 
 def rays(cameras, frame):

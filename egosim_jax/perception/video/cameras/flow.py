@@ -12,6 +12,8 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
+from egosim_jax.types.arrays import Masks, Video
+
 WORKING_PX = 960
 """Maximum side of a tracked image; larger images are downscaled to it."""
 MIN_CORNERS = 20
@@ -82,9 +84,7 @@ class Background:
         return there, good
 
 
-def background(
-    frames: UInt8[np.ndarray, "f h w 3"], moving: Bool[np.ndarray, "f h w"]
-) -> Background:
+def background(frames: Video, moving: Masks) -> Background:
     """Return a video's background, without moving pixels and a margin around them."""
     import cv2
 

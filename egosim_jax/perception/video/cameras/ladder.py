@@ -19,7 +19,7 @@ from functools import cached_property
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, UInt8
 
 from egosim_jax.perception.video.cameras.colmap import ColmapConfig, ColmapError, Scene, open_scene
 from egosim_jax.perception.video.cameras.flow import (
@@ -40,6 +40,7 @@ from egosim_jax.perception.video.cameras.rotation import (
 from egosim_jax.perception.video.estimates import CameraEstimate, ChosenRung, Rung, Verdict
 from egosim_jax.runtime.progress import track
 from egosim_jax.types import Cameras, InputError, check_video
+from egosim_jax.types.arrays import Masks, Poses, Video
 
 ASSUMED_VIEW_DEG = 90.0
 """Assumed field of view if the focal length of a static or turning camera is unknown."""
@@ -60,11 +61,7 @@ class CameraLadder:
     colmap: ColmapConfig = field(default_factory=ColmapConfig)
 
     def __call__(
-        self,
-        frames: UInt8[np.ndarray, "f h w 3"],
-        moving: Bool[np.ndarray, "f h w"],
-        *,
-        focal_px: float | None = None,
+        self, frames: Video, moving: Masks, *, focal_px: float | None = None
     ) -> CameraEstimate:
         """Return the cameras of a video. `focal_px` is the device's focal length, if known.
 
@@ -276,9 +273,7 @@ class _Climb:
         half = np.radians(ASSUMED_VIEW_DEG / 2)
         return float(max(self.frames.shape[1:3]) / 2 / np.tan(half))
 
-    def _pinhole(
-        self, rung: Rung, poses: Float[np.ndarray, "f 4 4"], focal_px: float, reason: str
-    ) -> CameraEstimate:
+    def _pinhole(self, rung: Rung, poses: Poses, focal_px: float, reason: str) -> CameraEstimate:
         """Return an accepted estimate without points."""
         height, width = self.frames.shape[1:3]
         if f"{rung}_assumed_view_deg" in self.figures:

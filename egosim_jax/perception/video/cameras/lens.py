@@ -15,6 +15,7 @@ from jaxtyping import Float, Shaped
 from egosim_jax.data.readers import lenses
 from egosim_jax.perception.video.estimates import CameraEstimate, Lens
 from egosim_jax.types import InputError
+from egosim_jax.types.arrays import Matrix
 
 
 def pinhole_focal(lens: Lens, *, height: int, width: int) -> float:
@@ -67,14 +68,14 @@ def undistort_pixels(
 
 
 def to_pinhole(
-    pixels_px: Float[np.ndarray, "*b 2"], lens: Lens, intrinsics_px: Float[np.ndarray, "3 3"]
+    pixels_px: Float[np.ndarray, "*b 2"], lens: Lens, intrinsics_px: Matrix
 ) -> Float[np.ndarray, "*b 2"]:
     """Return the places of recorded pixels in a pinhole camera with the same center."""
     rays = _model(lens, intrinsics_px).unproject(pixels_px.reshape(-1, 2))
     return rays.reshape(pixels_px.shape) * intrinsics_px[0, 0] + intrinsics_px[:2, 2]
 
 
-def _model(lens: Lens, intrinsics_px: Float[np.ndarray, "3 3"]) -> lenses.Lens:
+def _model(lens: Lens, intrinsics_px: Matrix) -> lenses.Lens:
     """Return the lens of the recorded frames; it shares the pinhole camera's center."""
     recorded = intrinsics_px.astype(float).copy()
     recorded[[0, 1], [0, 1]] = lens.focal_px

@@ -9,16 +9,17 @@ from egosim_jax.perception.video.cameras.gate import Reconstruction
 from egosim_jax.perception.video.cameras.lens import pinhole_focal, to_pinhole
 from egosim_jax.perception.video.estimates import CameraEstimate, Lens, SparsePoints, Verdict
 from egosim_jax.types import Cameras
+from egosim_jax.types.arrays import Matrix, Poses
 
 
-def pinhole(focal_px: float, *, height: int, width: int) -> Float[np.ndarray, "3 3"]:
+def pinhole(focal_px: float, *, height: int, width: int) -> Matrix:
     """Return intrinsics with the principal point at the image center."""
     return np.array([[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1.0]])
 
 
 def complete_path(
     frames: Int[np.ndarray, " r"], poses: Float[np.ndarray, "r 4 4"], count: int
-) -> Float[np.ndarray, "f 4 4"]:
+) -> Poses:
     """Return a pose for each of `count` frames; missing poses are interpolated (slerp).
 
     `frames` ascends from 0 to `count` - 1.

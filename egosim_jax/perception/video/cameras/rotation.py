@@ -15,6 +15,7 @@ from jaxtyping import Float, Float32
 
 from egosim_jax.perception.video.cameras.flow import MIN_CORNERS, Background
 from egosim_jax.perception.video.cameras.path import pinhole
+from egosim_jax.types.arrays import Matrix, Vector
 
 MIN_KEPT = 0.4
 """Minimum fraction of a key frame's corners; below it, a new key frame begins."""
@@ -69,7 +70,7 @@ def follow_corners(video: Background, *, bridge: int = 5) -> Tracks:
     return Tracks(keys=tuple(keys), starts=tuple(starts), ends=tuple(ends))
 
 
-def solve_rotations(tracks: Tracks, intrinsics_px: Float[np.ndarray, "3 3"]) -> Rotations:
+def solve_rotations(tracks: Tracks, intrinsics_px: Matrix) -> Rotations:
     """Return the rotations that best explain the tracks, for intrinsics at working size."""
     count = len(tracks.keys)
     poses = np.full((count, 3, 3), np.nan)
@@ -119,9 +120,9 @@ def find_focal(
 def _solve(
     starts: Float32[np.ndarray, "n 2"],
     ends: Float32[np.ndarray, "n 2"],
-    intrinsics_px: Float[np.ndarray, "3 3"],
-    rotation: Float[np.ndarray, "3 3"],
-) -> tuple[Float[np.ndarray, "3 3"], float]:
+    intrinsics_px: Matrix,
+    rotation: Matrix,
+) -> tuple[Matrix, float]:
     """Return the rotation from the key frame's axes to the frame's, and the median residual."""
     import cv2
     from scipy.optimize import least_squares
@@ -129,7 +130,7 @@ def _solve(
     focal, center = intrinsics_px[0, 0], intrinsics_px[:2, 2]
     rays = np.concatenate([(starts - center) / focal, np.ones((len(starts), 1))], axis=1)
 
-    def gaps(step: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " m"]:
+    def gaps(step: Vector) -> Float[np.ndarray, " m"]:
         turned = rays @ (cv2.Rodrigues(step)[0] @ rotation).T
         return (turned[:, :2] / np.maximum(turned[:, 2:], 1e-6) * focal + center - ends).ravel()
 

@@ -9,7 +9,6 @@ Depth from networks is in `networks`; the state made from depth is in `state.dep
 `complete` for all other pixels.
 """
 
-from egosim_jax.perception.video.depth.density import points_per_pixel
-from egosim_jax.perception.video.depth.swept import SweptDepth
+from egosim_jax.perception.video.depth.swept import SweptDepth, points_per_pixel
 
 __all__ = ["SweptDepth", "points_per_pixel"]

@@ -15,7 +15,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32
+
+from egosim_jax.types.arrays import RgbImage
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +37,7 @@ class Diffusion:
 
     def __call__(
         self,
-        image: UInt8[np.ndarray, "h w 3"],
+        image: RgbImage,
         measured: Float[np.ndarray, "h w"],
         confidence: Float[np.ndarray, "h w"],
     ) -> Float32[np.ndarray, "h w"]:
@@ -56,7 +58,7 @@ class Diffusion:
 
     def _solve(
         self,
-        image: UInt8[np.ndarray, "h w 3"],
+        image: RgbImage,
         measured: Float[np.ndarray, "h w"],
         confidence: Float[np.ndarray, "h w"],
         start: Float[np.ndarray, "h w"],
@@ -86,7 +88,7 @@ class Diffusion:
         return solved.reshape(height, width).astype(np.float32)
 
     def _weights(
-        self, image: UInt8[np.ndarray, "h w 3"]
+        self, image: RgbImage
     ) -> tuple[Float[np.ndarray, "h w-1"], Float[np.ndarray, "h-1 w"]]:
         """Return lambda w_ij between each pixel and its neighbors to the right and below."""
         import cv2

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32
 
 from egosim_jax.geometry import invert
 from egosim_jax.types import Cameras, Counted
+from egosim_jax.types.arrays import Mask, Masks, RgbImage, Video
 
 PARALLAX = 0.12
 """Best baseline of a view, in median depths."""
@@ -60,8 +61,8 @@ class PlaneSweep(Counted):
 
     def __call__(
         self,
-        frames: UInt8[np.ndarray, "f h w 3"],
-        moving: Bool[np.ndarray, "f h w"],
+        frames: Video,
+        moving: Masks,
         cameras: Cameras,
         frame: int,
         views: list[int],
@@ -111,7 +112,7 @@ class PlaneSweep(Counted):
         scores: Float32[np.ndarray, "d h w"],
         inverses: Float[np.ndarray, " d"],
         deviation: Float32[np.ndarray, "h w"],
-        hidden: Bool[np.ndarray, "h w"],
+        hidden: Mask,
     ) -> SweptFrame:
         """Return the best depth of each pixel, interpolated between planes by a parabola."""
         count = len(inverses)
@@ -209,7 +210,7 @@ def _mean(image: Float32[np.ndarray, "h w"], side: int) -> Float32[np.ndarray, "
     return cv2.boxFilter(image, cv2.CV_32F, (side, side), borderType=cv2.BORDER_REFLECT)
 
 
-def _gray(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
+def _gray(image: RgbImage) -> Float32[np.ndarray, "h w"]:
     import cv2
 
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255

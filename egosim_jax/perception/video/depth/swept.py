@@ -9,17 +9,23 @@ import numpy as np
 from einops import reduce
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from egosim_jax.geometry import invert, pixel_rays
+from egosim_jax.geometry import invert, pixel_rays, pixels_of, transform
 from egosim_jax.perception.video.depth.complete import Diffusion
 from egosim_jax.perception.video.depth.sweep import PlaneSweep, choose_views
 from egosim_jax.perception.video.depth.triangulate import SparseFilter, Triangulation
 from egosim_jax.perception.video.estimates import CameraEstimate, DepthEstimate
+from egosim_jax.rendering import POINT_PX
 from egosim_jax.types import Cameras, Counted, InputError
+from egosim_jax.types.arrays import Mask, Masks, Video
 
 METRIC_DISTANCE_M = 0.6
 """Distance of the assumed plane from metric cameras, in meters."""
 MAX_DEPTH = 10.0
 """Maximum depth of the assumed plane in a turned camera, in distances of the plane."""
+DENSITY_STEP_PX = 8
+"""Spacing of the points that decide about the density, in pixels."""
+MIN_MAGNIFIED = 0.02
+"""Minimum fraction of magnified points, over all views, for a higher density."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,11 +54,7 @@ class SweptDepth(Counted):
     """Completion of pixels that were not measured."""
 
     def __call__(
-        self,
-        frames: UInt8[np.ndarray, "f h w 3"],
-        moving: Bool[np.ndarray, "f h w"],
-        estimate: CameraEstimate,
-        wanted: Sequence[int],
+        self, frames: Video, moving: Masks, estimate: CameraEstimate, wanted: Sequence[int]
     ) -> DepthEstimate:
         """Return dense depth of the wanted frames in the unit of the cameras.
 
@@ -92,13 +94,13 @@ class SweptDepth(Counted):
 
     def _frame(
         self,
-        frames: UInt8[np.ndarray, "f h w 3"],
-        hidden: Bool[np.ndarray, "f h w"],
+        frames: Video,
+        hidden: Masks,
         cameras: Cameras,
         frame: int,
         pixels: Float[np.ndarray, "n 2"],
         depth: Float[np.ndarray, " n"],
-    ) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    ) -> tuple[Float32[np.ndarray, "h w"], Mask]:
         """Return a downscaled frame's completed inverse depth, and True for measured pixels."""
         far, near = (float(np.percentile(1 / depth, p)) for p in self.percentiles)
         widen = max(1 + self.margin, float(np.sqrt(self.min_ratio * far / near)))
@@ -116,10 +118,7 @@ class SweptDepth(Counted):
 
 
 def reduce_video(
-    frames: UInt8[np.ndarray, "f h w 3"],
-    moving: Bool[np.ndarray, "f h w"],
-    cameras: Cameras,
-    factor: int,
+    frames: Video, moving: Masks, cameras: Cameras, factor: int
 ) -> tuple[UInt8[np.ndarray, "f r c 3"], Bool[np.ndarray, "f r c"], Cameras]:
     """Return downscaled frames, moving pixels and cameras. Remaining rows and columns are cropped.
 
@@ -185,3 +184,20 @@ def _enlarge(values: Float32[np.ndarray, "r c"], cameras: Cameras) -> Float32[np
 
     size = cameras.width, cameras.height
     return cv2.resize(values, size, interpolation=cv2.INTER_LINEAR)
+
+
+def points_per_pixel(depth_m: DepthMap, cameras: Cameras) -> int:
+    """Return the number of points along each side of a first-frame pixel: 1 or 2.
+
+    2 is for clips that see a part of the scene from less than half the first frame's distance. It
+    is not the default because denser points look less sharp where nothing is magnified.
+    """
+    sampled = np.s_[::DENSITY_STEP_PX, ::DENSITY_STEP_PX]
+    rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)[sampled]
+    finite = np.isfinite(depth_m[sampled])
+    depth = depth_m[sampled][finite]
+    points = transform(cameras.world_from_camera[0], rays[finite] * depth[:, None])
+    local = transform(invert(cameras.world_from_camera), points[None])
+    inside = pixels_of(cameras, local)[2]
+    nearer = (local[..., 2] * POINT_PX < depth) & inside
+    return 2 if nearer.sum() > MIN_MAGNIFIED * inside.sum() else 1

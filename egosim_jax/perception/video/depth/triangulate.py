@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, UInt8
 from egosim_jax.geometry import invert, transform
 from egosim_jax.perception.video.estimates import SparsePoints
 from egosim_jax.types import Cameras, Counted
+from egosim_jax.types.arrays import Mask, Masks, Points, Video
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,13 +37,7 @@ class Triangulation(Counted):
     max_angle_deg: float = 60.0
     """Maximum angle in degrees; a larger one indicates a point that moves with the camera."""
 
-    def __call__(
-        self,
-        frames: UInt8[np.ndarray, "f h w 3"],
-        moving: Bool[np.ndarray, "f h w"],
-        cameras: Cameras,
-        frame: int,
-    ) -> SparsePoints:
+    def __call__(self, frames: Video, moving: Masks, cameras: Cameras, frame: int) -> SparsePoints:
         """Return the world points of a frame's corners; there may be no points."""
         import cv2
 
@@ -61,7 +56,7 @@ class Triangulation(Counted):
     def _follow(
         self,
         gray: list[np.ndarray],
-        moving: Bool[np.ndarray, "f h w"],
+        moving: Masks,
         pixels: Float[np.ndarray, "f n 2"],
         frame: int,
         step: int,
@@ -123,11 +118,7 @@ class Triangulation(Counted):
         )
 
     def _angle_deg(
-        self,
-        points: Float[np.ndarray, "n 3"],
-        seen: Bool[np.ndarray, "f n"],
-        cameras: Cameras,
-        frame: int,
+        self, points: Points, seen: Bool[np.ndarray, "f n"], cameras: Cameras, frame: int
     ) -> Float[np.ndarray, " n"]:
         """Return the maximum angle between a point's ray in its frame and in any other."""
         rays = points - cameras.world_from_camera[:, None, :3, 3]
@@ -153,11 +144,7 @@ class SparseFilter(Counted):
     """Accepted difference from the neighbors' median, in median absolute deviations."""
 
     def __call__(
-        self,
-        points: SparsePoints,
-        cameras: Cameras,
-        frame: int,
-        moving: Bool[np.ndarray, "h w"],
+        self, points: SparsePoints, cameras: Cameras, frame: int, moving: Mask
     ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
         """Return pixels (column, row) and depths of the trusted points of a frame.
 
@@ -195,10 +182,7 @@ class SparseFilter(Counted):
 
 
 def triangulate_frames(
-    frames: UInt8[np.ndarray, "f h w 3"],
-    moving: Bool[np.ndarray, "f h w"],
-    cameras: Cameras,
-    wanted: Sequence[int],
+    frames: Video, moving: Masks, cameras: Cameras, wanted: Sequence[int]
 ) -> SparsePoints | None:
     """Return the corner points of some frames; None if no corner shows parallax."""
     parts = [Triangulation()(frames, moving, cameras, frame) for frame in wanted]

@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields, replace
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 
 from egosim_jax.perception.video.hands.litert import HandNetworks
 from egosim_jax.perception.video.hands.palms import Palms, cut_tile, decode_palms, make_tiles
@@ -25,6 +25,7 @@ from egosim_jax.perception.video.hands.regions import (
     regions_of_palms,
     unrotate,
 )
+from egosim_jax.types.arrays import Video
 
 _PALM = [0, 1, 2, 5, 9, 13, 17]
 _KNUCKLES = [5, 9, 13, 17]
@@ -131,7 +132,7 @@ def right_by_bend(joints_m: Float[np.ndarray, "n 21 3"]) -> Float[np.ndarray, " 
 
 
 def find_other_side(
-    frames: UInt8[np.ndarray, "f h w 3"],
+    frames: Video,
     networks: HandNetworks,
     hands: Candidates,
     *,
@@ -161,7 +162,7 @@ def find_other_side(
 
 
 def find_candidates(
-    frames: UInt8[np.ndarray, "f h w 3"],
+    frames: Video,
     networks: HandNetworks,
     *,
     min_palm: float,

@@ -9,7 +9,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
 
 from egosim_jax.perception.video.estimates import LEFT, RIGHT, HandTracks
 from egosim_jax.perception.video.hands.detect import Candidates, find_candidates, find_other_side
@@ -23,6 +22,7 @@ from egosim_jax.perception.video.hands.track import (
     smoothing,
 )
 from egosim_jax.types import check_video
+from egosim_jax.types.arrays import Video
 
 SKIN_RGB = (224, 172, 140)
 """Color for painting the luminance, to detect hands in gloves."""
@@ -56,14 +56,14 @@ class LandmarkHands:
     networks: HandNetworks | None = None
     """Loaded networks; None to load them from `weights`."""
 
-    def __call__(self, frames: UInt8[np.ndarray, "f h w 3"]) -> HandTracks:
+    def __call__(self, frames: Video) -> HandTracks:
         """Return the hands of a video."""
         check_video("The video", frames)
         smaller, scale = _shrunk(frames, self.max_side)
         tracks = self.tracks(self.candidates(smaller), len(frames))
         return replace(tracks, joints_px=(tracks.joints_px + 0.5) / scale - 0.5)
 
-    def candidates(self, frames: UInt8[np.ndarray, "f h w 3"]) -> Candidates:
+    def candidates(self, frames: Video) -> Candidates:
         """Return the possible hands of all frames, searched at the frames' size.
 
         Frames without a hand are searched again for gloves. A tracked hand whose joints look like
@@ -126,7 +126,7 @@ def _shrunk(frames: np.ndarray, max_side: int) -> tuple[np.ndarray, np.ndarray]:
     return smaller, np.array(size) / [width, height]
 
 
-def paint_skin(frames: UInt8[np.ndarray, "f h w 3"]) -> UInt8[np.ndarray, "f h w 3"]:
+def paint_skin(frames: Video) -> Video:
     """Return frames with their luminance in skin color."""
     gray = np.stack([cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames])
     table = np.round(np.arange(256)[:, None] * np.array(SKIN_RGB) / max(SKIN_RGB)).astype(np.uint8)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from egosim_jax.perception.video.estimates import HandTracks
+from egosim_jax.types.arrays import Matrix
 
 PALM_BONES = np.array([(0, 5), (0, 9), (0, 13), (0, 17), (5, 17)])
 """Pairs of joints whose distance stays equal in a hand."""
@@ -21,9 +22,7 @@ SMOOTH_S = 0.12
 """Standard deviation of the smoothing of depth over time, in seconds."""
 
 
-def lift(
-    tracks: HandTracks, intrinsics_px: Float[np.ndarray, "3 3"]
-) -> Float[np.ndarray, "f 2 21 3"]:
+def lift(tracks: HandTracks, intrinsics_px: Matrix) -> Float[np.ndarray, "f 2 21 3"]:
     """Return the hands' keypoints in meters, in the camera of each frame; NaN if missing.
 
     A hand also counts as missing if its fit has a keypoint behind the camera.

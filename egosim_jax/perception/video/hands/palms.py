@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
+from egosim_jax.types.arrays import RgbImage
+
 INPUT = 192
 """Height and width of the detector's input in pixels."""
 PALM_KEYPOINTS = 7
@@ -72,7 +74,7 @@ def make_tiles(height: int, width: int) -> list[Tile]:
     return tiles
 
 
-def cut_tile(frame: UInt8[np.ndarray, "h w 3"], tile: Tile) -> UInt8[np.ndarray, "192 192 3"]:
+def cut_tile(frame: RgbImage, tile: Tile) -> UInt8[np.ndarray, "192 192 3"]:
     """Return a tile at the detector's size, zero outside the frame."""
     height, width = frame.shape[:2]
     left, top = tile.left_px, tile.top_px

@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from egosim_jax.types.arrays import RgbImage
+
 CROP = 224
 """Height and width of the landmark network's input in pixels."""
 _SIZED_BY = np.array([0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18])
@@ -52,9 +54,7 @@ def regions_of_joints(joints_px: Float[np.ndarray, "n 21 2"]) -> Regions:
     return _enlarged(center, high - low, angle, shift=-0.1, scale=2.0)
 
 
-def crop_region(
-    frame: UInt8[np.ndarray, "h w 3"], regions: Regions, index: int
-) -> UInt8[np.ndarray, "224 224 3"]:
+def crop_region(frame: RgbImage, regions: Regions, index: int) -> UInt8[np.ndarray, "224 224 3"]:
     """Return the upright crop of one region; zero outside the image."""
     to_image = regions.size_px[index] / CROP * _turn(regions.angle[index : index + 1])[0]
     center = regions.center_px[index] - to_image @ np.full(2, (CROP - 1) / 2)

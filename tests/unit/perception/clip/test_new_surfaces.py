@@ -6,18 +6,14 @@ import pytest
 from egosim_jax.geometry import look_at, pixel_rays
 from egosim_jax.perception.clip.new_surfaces import NewSurfaces
 from egosim_jax.perception.pipeline import Observation
-from egosim_jax.types import Action, Cameras, Clip, SceneState
+from egosim_jax.types import Clip
+from tests.scenes import pinhole, state_of, without_hands
 
 HEIGHT, WIDTH, FRAMES = 36, 48, 3
 OAK, STONE = np.array([190, 150, 100]), np.array([110, 112, 120])
 UP = np.array([0.0, 0.0, 1.0])
 POSE = look_at(np.array([0.0, -0.3, 0.5]), np.zeros(3), up=UP)
-CAMERAS = Cameras(
-    world_from_camera=np.repeat(POSE[None], FRAMES, axis=0),
-    intrinsics_px=np.array([[45.0, 0, 23.5], [0, 45.0, 17.5], [0, 0, 1]]),
-    height=HEIGHT,
-    width=WIDTH,
-)
+CAMERAS = pinhole([POSE] * FRAMES, 45.0, HEIGHT, WIDTH)
 RAYS = pixel_rays(CAMERAS.intrinsics_px, height=HEIGHT, width=WIDTH) @ POSE[:3, :3].T
 TABLE_M = -POSE[2, 3] / RAYS[..., 2]
 """Depth of the table in each pixel."""
@@ -28,14 +24,7 @@ RIGHT_M = POSE[0, 3] + TABLE_M * RAYS[..., 0]
 def perceive(colors, *, ids=None, motions=(), supports=()):
     """Return the stage's result for a state with the left half of a table."""
     x, y = (v.ravel() for v in np.meshgrid(np.arange(-0.5, 0, 0.004), np.arange(-0.4, 0.6, 0.004)))
-    count = len(x)
-    state = SceneState(
-        points_m=np.stack([x, y, 0 * x], axis=1).astype(np.float32),
-        colors=np.repeat(OAK[None], count, axis=0).astype(np.uint8),
-        object_ids=np.zeros(count, np.int32),
-        last_seen=np.zeros(count, np.int32),
-        intrinsics_px=CAMERAS.intrinsics_px,
-    )
+    state = state_of(np.stack([x, y, 0 * x], axis=1), colors=OAK)
     frames = np.repeat(colors[None].astype(np.uint8), FRAMES, axis=0)
     so_far = Observation(
         cameras=CAMERAS,
@@ -44,9 +33,7 @@ def perceive(colors, *, ids=None, motions=(), supports=()):
         motions=dict(motions),
         support_planes=dict(supports),
     )
-    hands = np.full((FRAMES, 1, 21, 3), np.nan)
-    action = Action(cameras=CAMERAS, joints_m=hands, kind="human", prompt="")
-    return NewSurfaces()(Clip(frames=frames, fps=8), action, state, so_far)
+    return NewSurfaces()(Clip(frames=frames, fps=8), without_hands(CAMERAS), state, so_far)
 
 
 def test_the_table_continues_up_to_its_edge():

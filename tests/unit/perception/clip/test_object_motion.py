@@ -11,16 +11,12 @@ from egosim_jax.geometry import look_at
 from egosim_jax.perception.clip.object_motion import TrackObjects
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.rendering.reference import render
-from egosim_jax.types import Action, Cameras, Clip, SceneState
+from egosim_jax.types import Action, Clip
+from tests.scenes import pinhole, state_of
 
 FRAMES = 13
 CAMERA = look_at(np.array([0, -0.35, 0.4]), np.array([0, 0, 0.0]), up=np.array([0, 0, 1.0]))
-CAMERAS = Cameras(
-    world_from_camera=np.repeat(CAMERA[None], FRAMES, axis=0),
-    intrinsics_px=np.array([[120.0, 0, 79.5], [0, 120, 47.5], [0, 0, 1]]),
-    height=96,
-    width=160,
-)
+CAMERAS = pinhole([CAMERA] * FRAMES, 120.0, 96, 160)
 OPENING = np.array([0.08, 0.08, 0.06] + [0.04] * (FRAMES - 3))
 """Opening of a gripper that closes on a cube of 4 cm in the fourth frame."""
 SIDE = np.arange(-0.3, 0.3, 0.004)
@@ -32,16 +28,14 @@ CUBE = np.stack(np.meshgrid(EDGE, EDGE, EDGE + 0.02), axis=-1).reshape(-1, 3)
 def make_state(*places):
     """Return a state with cubes, with the ids 1, 2, ..., at places on a table."""
     cubes = [CUBE + [x, y, 0] for x, y in places]
-    points = np.concatenate([TABLE, *cubes]).astype(np.float32)
+    points = np.concatenate([TABLE, *cubes])
     ids = np.repeat(np.arange(len(cubes) + 1), [len(TABLE), *(len(CUBE) for _ in cubes)])
     red = np.array([200, 30, 30]) + np.arange(len(points))[:, None] % 2 * [0, 20, 40]
-    return SceneState(
-        points_m=points,
-        colors=np.where(ids[:, None] > 0, red, [150, 140, 120]).astype(np.uint8),
-        object_ids=ids.astype(np.int32),
+    return state_of(
+        points,
+        colors=np.where(ids[:, None] > 0, red, [150, 140, 120]),
+        ids=ids,
         names={number + 1: f"red cube {number + 1}" for number in range(len(cubes))},
-        last_seen=np.zeros(len(points), np.int32),
-        intrinsics_px=CAMERAS.intrinsics_px,
         provenance={"world": "tabletop"},
     )
 

@@ -11,9 +11,10 @@ from egosim_jax.perception.classical import take_action
 from egosim_jax.perception.networks.align_depth import DepthAlignment
 from egosim_jax.perception.networks.closed_loop import EstimateDepth, Segment, keep_changes
 from egosim_jax.perception.pipeline import Observation, Pipeline, find_interactions
-from egosim_jax.perception.video.estimates import DepthEstimate, DepthEstimator, Segmenter
+from egosim_jax.perception.video.estimates import DepthEstimate
 from egosim_jax.rendering.reference import render
-from egosim_jax.types import Action, Cameras, Clip, InputError, SceneState
+from egosim_jax.types import Action, Clip, InputError, SceneState
+from tests.scenes import pinhole, state_of, without_hands
 
 FRAMES, HEIGHT, WIDTH = 9, 120, 160
 CUP, BOX = 3, 7
@@ -40,12 +41,10 @@ def scene():
     contrast = {
         n: np.clip(4.0 * (c.astype(float) - 127) + 127, 0, 255) for n, (_, c) in parts.items()
     }
-    return SceneState(
-        points_m=np.concatenate([p for p, _ in parts.values()]).astype(np.float32),
-        colors=np.concatenate(list(contrast.values())).astype(np.uint8),
-        object_ids=np.concatenate([np.full(len(p), n, np.int32) for n, (p, _) in parts.items()]),
-        last_seen=np.zeros(sum(len(p) for p, _ in parts.values()), np.int32),
-        intrinsics_px=cameras().intrinsics_px,
+    return state_of(
+        np.concatenate([p for p, _ in parts.values()]),
+        colors=np.concatenate(list(contrast.values())),
+        ids=np.concatenate([np.full(len(p), n) for n, (p, _) in parts.items()]),
         names={CUP: "red cup", BOX: "box"},
     )
 
@@ -53,10 +52,7 @@ def scene():
 def cameras():
     eyes = [np.array([0.01 * k, -0.35, 0.55]) for k in range(FRAMES)]
     poses = [look_at(eye, np.zeros(3), up=np.array([0, 0, 1.0])) for eye in eyes]
-    matrix = np.array([[150.0, 0, 79.5], [0, 150, 59.5], [0, 0, 1]])
-    return Cameras(
-        world_from_camera=np.stack(poses), intrinsics_px=matrix, height=HEIGHT, width=WIDTH
-    )
+    return pinhole(poses, 150.0, HEIGHT, WIDTH)
 
 
 def motion(frame):
@@ -91,10 +87,7 @@ def made():
         np.concatenate([getattr(v, name) for v in views])
         for name in ("frames", "depth_m", "object_ids")
     )
-    action = Action(
-        cameras=cameras(), joints_m=np.full((FRAMES, 1, 21, 3), np.nan), kind="human", prompt=""
-    )
-    return Made(state, action, Clip(frames=frames, fps=8), depth, ids)
+    return Made(state, without_hands(cameras()), Clip(frames=frames, fps=8), depth, ids)
 
 
 @dataclass(frozen=True)
@@ -148,11 +141,6 @@ def stages(made):
 @pytest.fixture(scope="module")
 def perceived(made):
     return Pipeline(stages=stages(made))(made.clip, made.action, made.state)
-
-
-def test_the_substitutes_satisfy_the_protocols(made):
-    assert isinstance(Masks(made.object_ids), Segmenter)
-    assert isinstance(Depth(made.depth_m), DepthEstimator)
 
 
 def test_instances_get_the_ids_of_the_state_or_new_ids(made, perceived):

@@ -10,7 +10,8 @@ from egosim_jax.geometry import invert
 from egosim_jax.perception.networks.depth_anything_3 import DepthAnything3, DepthAnything3Cameras
 from egosim_jax.perception.networks.worker import close_workers
 from egosim_jax.perception.video.estimates import CameraEstimate, Verdict
-from egosim_jax.types import Cameras, InputError
+from egosim_jax.types import InputError
+from tests.scenes import pinhole
 from tests.unit.perception.video.cameras import room
 
 PACKAGE = """
@@ -48,8 +49,7 @@ def estimate(step=None, *, metric=False):
     if step is not None:
         poses = np.stack([np.eye(4)] * 10)
         poses[:, 0, 3] = step * np.arange(10)
-        matrix = np.array([[12.0, 0, 5.5], [0, 12, 3.5], [0, 0, 1]])
-        cameras = Cameras(world_from_camera=poses, intrinsics_px=matrix, height=8, width=12)
+        cameras = pinhole(poses, 12.0, 8, 12)
     verdict = Verdict(rung="given", reason="", figures={})
     return CameraEstimate(cameras=cameras, metric=metric, verdict=verdict)
 

@@ -8,7 +8,8 @@ import torch
 
 from egosim_jax.perception.networks.depth_pro import DepthPro, focal_of
 from egosim_jax.perception.networks.worker import close_workers
-from egosim_jax.types import Cameras, InputError
+from egosim_jax.types import InputError
+from tests.scenes import pinhole
 from tests.unit.perception.networks import tiny
 from tests.unit.perception.posed import UNKNOWN_CAMERAS
 
@@ -58,12 +59,8 @@ def test_depth_and_focal_length_follow_the_field_of_view(folder, expected):
 
 
 def test_a_known_focal_length_replaces_the_estimated_one(folder, expected):
-    matrix = np.array([[90.0, 0, 29.5], [0, 90, 19.5], [0, 0, 1]])
-    cameras = Cameras(
-        world_from_camera=np.stack([np.eye(4)] * 2), intrinsics_px=matrix, height=HEIGHT,
-        width=WIDTH,
-    )  # fmt: skip
-    found = DepthPro(folder)(FRAMES, STILL, replace(UNKNOWN_CAMERAS, cameras=cameras), [1])
+    given = replace(UNKNOWN_CAMERAS, cameras=pinhole(2, 90.0, HEIGHT, WIDTH))
+    found = DepthPro(folder)(FRAMES, STILL, given, [1])
     check_depth(found.depth_m, expected[0][1:] * WIDTH / 90)
 
 

@@ -9,7 +9,7 @@ import torch  # noqa: F401
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.perception import registry
 from egosim_jax.perception.networks.worker import close_workers
-from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.types import VideoSpec
 from tests.unit.perception.networks import tiny
 
 pytestmark = pytest.mark.slow
@@ -52,13 +52,11 @@ def test_a_clip_of_the_world_is_perceived(folders):
     assert fingerprint(perceive) != fingerprint(registry.parse(text(folders, *detector)).build())
 
 
-def test_a_missing_detector_is_refused(folders, capsys):
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [((), "--detector-folder"), (("--hand-phrases", "glove"), "must each name a hand")],
+)
+def test_what_cannot_segment_is_refused(folders, capsys, options, message):
     with pytest.raises(SystemExit, match="2"):
-        registry.parse(text(folders))
-    assert "--detector-folder" in " ".join(capsys.readouterr().err.split())
-
-
-def test_phrases_for_hands_name_hands(folders, capsys):
-    with pytest.raises((SystemExit, InputError)):
-        registry.parse(text(folders, "--hand-phrases", "glove"))
-    assert "must each name a hand" in " ".join(capsys.readouterr().err.split())
+        registry.parse(text(folders, *options))
+    assert message in " ".join(capsys.readouterr().err.split())

@@ -4,11 +4,26 @@ import json
 from pathlib import Path
 
 
-def depth_anything(folder: Path, *, kind: str = "metric") -> Path:
+def transformers_with_seed():
+    """Return the library; `save_pretrained` then writes the same random weights in every run."""
     import torch
-    import transformers as hf
+    import transformers
 
     torch.manual_seed(0)
+    return transformers
+
+
+def _normal(parameters, std: float) -> None:
+    """Draw weights anew: with those of an initialization for training, all results are alike."""
+    import torch
+
+    with torch.no_grad():
+        for weight in parameters:
+            weight.normal_(std=std)
+
+
+def depth_anything(folder: Path, *, kind: str = "metric") -> Path:
+    hf = transformers_with_seed()
     backbone = hf.Dinov2Config(
         hidden_size=32, num_hidden_layers=4, num_attention_heads=4, image_size=56, patch_size=14,
         mlp_ratio=2, out_features=["stage1", "stage2", "stage3", "stage4"],
@@ -20,11 +35,7 @@ def depth_anything(folder: Path, *, kind: str = "metric") -> Path:
         fusion_hidden_size=16, head_hidden_size=8, depth_estimation_type=kind, max_depth=20,
     )  # fmt: skip
     network = hf.DepthAnythingForDepthEstimation(config)
-    with torch.no_grad():
-        for weight in network.head.parameters():
-            weight.normal_(
-                std=0.2
-            )  # initialized as for training, depth would be the same everywhere
+    _normal(network.head.parameters(), 0.2)
     network.save_pretrained(folder)
     hf.DPTImageProcessorPil(
         size={"height": 56, "width": 56}, keep_aspect_ratio=True, ensure_multiple_of=14
@@ -33,10 +44,7 @@ def depth_anything(folder: Path, *, kind: str = "metric") -> Path:
 
 
 def depth_pro(folder: Path) -> Path:
-    import torch
-    import transformers as hf
-
-    torch.manual_seed(0)
+    hf = transformers_with_seed()
     image = hf.Dinov2Config(
         hidden_size=16, num_hidden_layers=2, num_attention_heads=2, patch_size=4, image_size=8,
         mlp_ratio=2,
@@ -48,10 +56,8 @@ def depth_pro(folder: Path) -> Path:
         scaled_images_feature_dims=[12, 12], use_fov_model=True, num_fov_head_layers=0,
     )  # fmt: skip
     network = hf.DepthProForDepthEstimation(config)
-    with torch.no_grad():
-        for weight in network.head.parameters():
-            weight.normal_(std=0.3)
-        network.fov_model.head.layers[-1].bias.fill_(60.0)
+    _normal(network.head.parameters(), 0.3)
+    network.fov_model.head.layers[-1].bias.data.fill_(60.0)
     network.save_pretrained(folder)
     processor = {
         "image_processor_type": "DepthProImageProcessor", "size": {"height": 32, "width": 32},
@@ -71,10 +77,7 @@ def bert_tokenizer(folder: Path, words: list[str]):
 
 
 def grounding_dino(folder: Path, words=("red", "cup", "book", "hand", "arm")) -> Path:
-    import torch
-    import transformers as hf
-
-    torch.manual_seed(0)
+    hf = transformers_with_seed()
     config = hf.GroundingDinoConfig(
         d_model=32, encoder_layers=2, decoder_layers=2, encoder_attention_heads=4,
         decoder_attention_heads=4, encoder_ffn_dim=16, decoder_ffn_dim=16, num_queries=5,
@@ -153,10 +156,7 @@ IMAGENET = ([0.485, 0.456, 0.406], [0.229, 0.224, 0.225])
 
 def edgetam(folder: Path) -> Path:
     """EdgeTAM with SAM 2's vision encoder, because its own encoder RepViT needs another library."""
-    import torch
-    import transformers as hf
-
-    torch.manual_seed(0)
+    hf = transformers_with_seed()
     config = hf.EdgeTamVideoConfig(
         vision_config=_hiera(SIZE), **_prompted(SIZE, 16), **_memory(SIZE // 16), image_size=SIZE,
         memory_attention_rope_k_sizes=[4, 4], memory_attention_mlp_hidden_size=64,
@@ -169,10 +169,7 @@ def edgetam(folder: Path) -> Path:
 
 
 def sam2(folder: Path) -> Path:
-    import torch
-    import transformers as hf
-
-    torch.manual_seed(0)
+    hf = transformers_with_seed()
     config = hf.Sam2VideoConfig(
         vision_config=_hiera(SIZE), **_prompted(SIZE, 16), **_memory(SIZE // 16), image_size=SIZE,
         memory_attention_feed_forward_hidden_size=64,
@@ -183,10 +180,7 @@ def sam2(folder: Path) -> Path:
 
 
 def sam3(folder: Path, *, size: int = 112) -> Path:
-    import torch
-    import transformers as hf
-
-    torch.manual_seed(0)
+    hf = transformers_with_seed()
     grid = size // 14
     vision = {
         "model_type": "sam3_vision_model", "fpn_hidden_size": CHANNELS,
@@ -248,10 +242,7 @@ def clip_tokenizer():
 
 
 def qwen3_vl(folder: Path) -> Path:
-    import torch
-    import transformers as hf
-
-    torch.manual_seed(0)
+    hf = transformers_with_seed()
     tokenizer = hf.Qwen2Tokenizer(
         vocab={letter: number for number, letter in enumerate(_bytes())}, merges=[]
     )
@@ -289,10 +280,7 @@ def qwen3_vl(folder: Path) -> Path:
 
 
 def video_mae(folder: Path) -> Path:
-    import torch
-    import transformers as hf
-
-    torch.manual_seed(0)
+    hf = transformers_with_seed()
     config = hf.VideoMAEConfig(
         image_size=32, patch_size=8, num_frames=4, tubelet_size=2, hidden_size=24,
         num_hidden_layers=2, num_attention_heads=2, intermediate_size=32,
@@ -307,10 +295,7 @@ def video_mae(folder: Path) -> Path:
 
 
 def xclip(folder: Path) -> Path:
-    import torch
-    import transformers as hf
-
-    torch.manual_seed(0)
+    hf = transformers_with_seed()
     sizes = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2}
     config = hf.XCLIPConfig(
         text_config={
@@ -324,10 +309,7 @@ def xclip(folder: Path) -> Path:
         projection_dim=16, prompt_num_attention_heads=2,
     )  # fmt: skip
     network = hf.XCLIPModel(config)
-    with torch.no_grad():  # initialized as for training, all videos would be alike
-        for weight in network.parameters():
-            if weight.ndim > 1:
-                weight.normal_(std=0.2)
+    _normal((weight for weight in network.parameters() if weight.ndim > 1), 0.2)
     network.save_pretrained(folder)
     clip_tokenizer().save_pretrained(folder)
     processor = {

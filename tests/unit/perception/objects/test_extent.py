@@ -9,17 +9,11 @@ from egosim_jax.geometry import look_at
 from egosim_jax.perception.objects.extent import choose_extent
 from egosim_jax.perception.objects.film import ColorCost, Film, ObjectModel, ObjectMotion
 from egosim_jax.rendering.reference import render
-from egosim_jax.types import Cameras, SceneState
+from tests.scenes import pinhole, state_of
 
 FRAMES = 6
-CAMERAS = Cameras(
-    world_from_camera=np.repeat(
-        look_at(np.array([0, -0.5, 0.5]), np.zeros(3), up=np.array([0, 0, 1.0]))[None], FRAMES, 0
-    ),
-    intrinsics_px=np.array([[80.0, 0, 39.5], [0, 80, 23.5], [0, 0, 1]]),
-    height=48,
-    width=80,
-)
+CAMERA = look_at(np.array([0, -0.5, 0.5]), np.zeros(3), up=np.array([0, 0, 1.0]))
+CAMERAS = pinhole([CAMERA] * FRAMES, 80.0, 48, 80)
 SIDE = np.arange(-0.2, 0.2, 0.004)
 TABLE = np.stack(np.meshgrid(SIDE, SIDE, [0.0]), axis=-1).reshape(-1, 3)
 CUBE = np.stack(np.meshgrid(SIDE[45:56], SIDE[45:56], SIDE[50:61]), axis=-1).reshape(-1, 3)
@@ -52,13 +46,7 @@ def test_the_part_that_a_clip_shows_in_motion_is_chosen(part):
     drawer = ObjectModel(number=0, points_m=front, colors=paint[count:], plane=plane)
     most = ObjectModel(number=0, points_m=points[40:], colors=paint[40:], plane=plane)
     wood = np.full((len(TABLE), 3), (90, 100, 110), np.uint8)
-    scene = SceneState(
-        points_m=np.concatenate([TABLE, points]).astype(np.float32),
-        colors=np.concatenate([wood, paint.astype(np.uint8)]),
-        object_ids=np.zeros(len(TABLE) + len(points), np.int32),
-        last_seen=np.zeros(len(TABLE) + len(points), np.int32),
-        intrinsics_px=CAMERAS.intrinsics_px,
-    )
+    scene = state_of(np.concatenate([TABLE, points]), colors=np.concatenate([wood, paint]))
     moves = moved_to(0, -0.06, 0)
     candidates = [(-10.0, replace(moves, model=model)) for model in (whole, drawer, most)]
     frames = []
@@ -69,14 +57,9 @@ def test_the_part_that_a_clip_shows_in_motion_is_chosen(part):
         ).reshape(-1, 3) + np.array([0, shift[1] + SIDE[49], 0])
         rest = points + shift if part != "drawer" else np.concatenate([top, front + shift])
         extra = tray if part == "drawer" else tray[:0]
-        film = replace(
-            scene,
-            points_m=np.concatenate([TABLE, rest, extra]).astype(np.float32),
-            colors=np.concatenate(
-                [scene.colors, np.full((len(extra), 3), (200, 175, 130), np.uint8)]
-            ),
-            object_ids=np.zeros(len(TABLE) + len(rest) + len(extra), np.int32),
-            last_seen=np.zeros(len(TABLE) + len(rest) + len(extra), np.int32),
+        inside = np.full((len(extra), 3), (200, 175, 130), np.uint8)
+        film = state_of(
+            np.concatenate([TABLE, rest, extra]), colors=np.concatenate([scene.colors, inside])
         )
         one = replace(CAMERAS, world_from_camera=CAMERAS.world_from_camera[:1])
         frames.append(render(film, one, point_px=2).frames[0])

@@ -7,7 +7,7 @@ import pytest
 
 from egosim_jax.geometry import look_at
 from egosim_jax.perception.objects.growth import NEW, Growth, clusters_without_id
-from egosim_jax.types import SceneState
+from tests.scenes import state_of
 
 RED, BLUE, WOOD = (200, 30, 30), (30, 40, 190), (150, 140, 120)
 STEP_M = 0.004
@@ -30,17 +30,9 @@ def scene(*clusters):
     side = np.arange(-0.3, 0.3, STEP_M)
     table = np.stack(np.meshgrid(side, side, [0.0]), axis=-1).reshape(-1, 3)
     pieces = [(table, WOOD), *clusters]
-    points = np.concatenate([points for points, _ in pieces]).astype(np.float32)
-    return SceneState(
-        points_m=points,
-        colors=np.concatenate([np.full((len(p), 3), color) for p, color in pieces]).astype(
-            np.uint8
-        ),
-        object_ids=np.zeros(len(points), np.int32),
-        last_seen=np.zeros(len(points), np.int32),
-        intrinsics_px=np.eye(3),
-        provenance={"world": "tabletop"},
-    )
+    points = np.concatenate([points for points, _ in pieces])
+    colors = np.concatenate([np.full((len(p), 3), color) for p, color in pieces])
+    return state_of(points, colors=colors, provenance={"world": "tabletop"})
 
 
 def closed_on(thumb, fingers):

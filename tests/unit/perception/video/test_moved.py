@@ -5,20 +5,12 @@ import pytest
 
 from egosim_jax.perception.video.estimates import HandTracks
 from egosim_jax.perception.video.moved import find_moved
-from egosim_jax.types import Cameras
+from tests.scenes import pinhole
 from tests.unit.annotate.stubs import mean_hand, textured_video
 
 HEIGHT, WIDTH, FRAMES = 120, 200, 17
 BOX = slice(60, 90), slice(60, 90)
-
-
-def still_cameras():
-    return Cameras(
-        world_from_camera=np.tile(np.eye(4), (FRAMES, 1, 1)),
-        intrinsics_px=np.array([[100.0, 0, 99.5], [0, 100, 59.5], [0, 0, 1]]),
-        height=HEIGHT,
-        width=WIDTH,
-    )
+STILL = pinhole(FRAMES, 100.0, HEIGHT, WIDTH)
 
 
 def painted(steps, *, hand=True):
@@ -47,7 +39,7 @@ def find(frames, tracks, fps=8.0):
             hidden[frame] |= np.hypot(*np.mgrid[-y : HEIGHT - y, -x : WIDTH - x]) < 4
     frames = np.where(hidden[..., None], np.uint8(90), frames)
     depth = np.full((HEIGHT, WIDTH), 1.0)
-    return find_moved(frames, hidden, tracks, still_cameras(), depth, fps=fps), hidden
+    return find_moved(frames, hidden, tracks, STILL, depth, fps=fps), hidden
 
 
 def carried():

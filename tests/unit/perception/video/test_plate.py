@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from egosim_jax.perception.video.plate import clean_plate
-from egosim_jax.types import Cameras
 from egosim_jax.worlds.tabletop.scene import FIRST_HAND
+from tests.scenes import pinhole
 from tests.unit.perception.posed import make_clip
 
 
@@ -79,25 +79,12 @@ def test_a_hole_next_to_a_moved_object_is_filled_with_background(method, monkeyp
     moving[1:] &= ~moved[1:]  # the object is now in front of the hole
     frames[moved] = (220, 30, 30)
     frames[moving] = (20, 10, 5)
-    cameras = Cameras(
-        world_from_camera=np.tile(np.eye(4), (3, 1, 1)),
-        intrinsics_px=np.array([[50.0, 0, 44.5], [0, 50, 29.5], [0, 0, 1]]),
-        height=60,
-        width=90,
-    )
-    plate = clean_plate(frames, moving, cameras, np.ones((60, 90)), moved=moved)
+    plate = clean_plate(frames, moving, pinhole(3, 50.0, 60, 90), np.ones((60, 90)), moved=moved)
     hole = moving[0] & ~moved[0]
     assert plate.method == method
     assert not plate.seen.any()
     assert plate.image[hole, 0].max() < 150
     assert (plate.image[15:45, 15:37] == frames[0, 15:45, 15:37]).all()
-
-
-def test_without_the_library_telea_fills(clip, covered, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "patchmatch", None)
-    frames, moving, cameras = covered
-    plate = clean_plate(frames, moving | moving[0], cameras, clip.first.depth_m)
-    assert plate.method == "telea"
 
 
 def test_a_frame_without_hands_is_unchanged(clip, covered):

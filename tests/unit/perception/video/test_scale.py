@@ -14,7 +14,8 @@ from egosim_jax.perception.video.scale import (
     scale_cameras,
     scale_depth,
 )
-from egosim_jax.types import Cameras, InputError
+from egosim_jax.types import InputError
+from tests.scenes import pinhole
 
 UNIT_M = 0.37
 HEIGHT, WIDTH, FRAMES = 60, 80, 12
@@ -25,9 +26,8 @@ TABLE_M = 0.4
 def estimate():
     poses = np.repeat(np.eye(4)[None], FRAMES, axis=0)
     poses[:, 0, 3] = np.linspace(0, 0.05, FRAMES) / UNIT_M
-    matrix = np.array([[60.0, 0, 39.5], [0, 60, 29.5], [0, 0, 1]])
     return CameraEstimate(
-        cameras=Cameras(world_from_camera=poses, intrinsics_px=matrix, height=HEIGHT, width=WIDTH),
+        cameras=pinhole(poses, 60.0, HEIGHT, WIDTH),
         metric=False,
         verdict=Verdict(rung="incremental", reason="given to a test", figures={}),
     )

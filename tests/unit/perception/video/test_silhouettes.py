@@ -32,12 +32,3 @@ def test_they_cover_the_hands_and_little_else(clip, tracks):
     hands = clip.ids >= FIRST_HAND
     assert (covered & hands).sum() / hands.sum() > 0.9
     assert covered.mean() < 3 * hands.mean()
-
-
-def test_a_missing_hand_covers_nothing(clip, tracks):
-    nothing = HandTracks(
-        joints_px=np.full_like(tracks.joints_px, np.nan),
-        joints_hand_m=tracks.joints_hand_m,
-        presence=np.zeros_like(tracks.presence),
-    )
-    assert not track_silhouettes(clip.frames, nothing).any()

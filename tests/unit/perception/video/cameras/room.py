@@ -9,6 +9,7 @@ import numpy as np
 
 from egosim_jax.perception.video.estimates import Lens
 from egosim_jax.types import Cameras
+from tests.scenes import pinhole
 
 HEIGHT, WIDTH, FOCAL = 240, 320, 180.0
 STILL = np.zeros(3)
@@ -90,11 +91,4 @@ def path(
         poses[frame, :3, :3] = cv2.Rodrigues(np.radians(turn_deg) * share)[0]
         poses[frame, :3, 3] = (move + sway) * share if np.any(move) else 0
     height, width = (WIDTH, HEIGHT) if portrait else (HEIGHT, WIDTH)
-    return Cameras(
-        world_from_camera=poses,
-        intrinsics_px=np.array(
-            [[FOCAL, 0, (width - 1) / 2], [0, FOCAL, (height - 1) / 2], [0, 0, 1]]
-        ),
-        height=height,
-        width=width,
-    )
+    return pinhole(poses, FOCAL, height, width)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from egosim_jax.perception.video.cameras.lens import pinhole_focal, undistort, undistort_pixels
-from egosim_jax.perception.video.cameras.path import pinhole
 from egosim_jax.perception.video.estimates import CameraEstimate, Lens, Verdict
-from egosim_jax.types import Cameras, InputError
+from egosim_jax.types import InputError
+from tests.scenes import pinhole
 from tests.unit.perception.video.cameras.room import FOCAL, HEIGHT, WIDTH, path, render
 
 VERDICT = Verdict(rung="incremental", reason="a test", figures={})
@@ -14,12 +14,7 @@ VERDICT = Verdict(rung="incremental", reason="a test", figures={})
 
 def estimate(lens: Lens | None) -> CameraEstimate:
     focal = FOCAL if lens is None else pinhole_focal(lens, height=HEIGHT, width=WIDTH)
-    cameras = Cameras(
-        world_from_camera=np.eye(4)[None],
-        intrinsics_px=pinhole(focal, height=HEIGHT, width=WIDTH),
-        height=HEIGHT,
-        width=WIDTH,
-    )
+    cameras = pinhole(1, focal, HEIGHT, WIDTH)
     return CameraEstimate(cameras=cameras, metric=False, verdict=VERDICT, lens=lens)
 
 

@@ -7,7 +7,7 @@ import pytest
 from egosim_jax.perception.video.depth import SweptDepth
 from egosim_jax.perception.video.depth.triangulate import Triangulation, triangulate_frames
 from egosim_jax.perception.video.estimates import CameraEstimate, Verdict
-from egosim_jax.types import Cameras
+from tests.scenes import pinhole
 
 HEIGHT, WIDTH, FRAMES, STEP_PX = 96, 128, 9, 3
 FOCAL_PX, WALL = 100.0, 2.5
@@ -25,8 +25,7 @@ def frames():
 def cameras():
     poses = np.repeat(np.eye(4)[None], FRAMES, axis=0)
     poses[:, 0, 3] = np.arange(FRAMES) * STEP_PX * WALL / FOCAL_PX
-    matrix = np.array([[FOCAL_PX, 0, 63.5], [0, FOCAL_PX, 47.5], [0, 0, 1]])
-    return Cameras(world_from_camera=poses, intrinsics_px=matrix, height=HEIGHT, width=WIDTH)
+    return pinhole(poses, FOCAL_PX, HEIGHT, WIDTH)
 
 
 @pytest.mark.parametrize("frame", [0, 4])
@@ -52,17 +51,14 @@ def test_points_of_several_frames_are_joined(frames, cameras):
     assert np.array_equal(seen, other.points_m[other.indices])
 
 
-def test_a_camera_that_does_not_move_triangulates_nothing(frames, cameras):
+def test_a_camera_that_does_not_move_triangulates_nothing(frames):
     still = np.repeat(frames[:1], FRAMES, axis=0)
     moving = np.zeros(frames.shape[:3], bool)
     poses = np.repeat(np.eye(4)[None], FRAMES, axis=0)
     poses[:, 0, 3] = 1e-4 * np.arange(FRAMES)
-    found = Triangulation()(
-        still, moving, Cameras(**{**vars(cameras), "world_from_camera": poses}), 0
-    )
+    found = Triangulation()(still, moving, pinhole(poses, FOCAL_PX, HEIGHT, WIDTH), 0)
     assert not len(found.points_m)
-    there = np.repeat(np.eye(4)[None], FRAMES, axis=0)
-    fixed = Cameras(**{**vars(cameras), "world_from_camera": there})
+    fixed = pinhole(FRAMES, FOCAL_PX, HEIGHT, WIDTH)
     assert triangulate_frames(still, moving, fixed, [0]) is None
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from egosim_jax.annotate.config import AnnotateConfig
 from egosim_jax.perception.video.hands import LandmarkHands
-from egosim_jax.perception.video.hands.litert import LANDMARKS, MEDIAPIPE, PALMS, HandNetworks
+from egosim_jax.perception.video.hands.litert import LANDMARKS, PALMS, HandNetworks
 from egosim_jax.types import InputError
 
 pytest.importorskip("ai_edge_litert")
@@ -118,9 +118,3 @@ def test_offline_without_weights_is_refused_with_a_fix(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     with pytest.raises(InputError, match="egosim models fetch hands"):
         LandmarkHands(offline=True)(BLACK)
-
-
-def test_the_networks_and_their_license_are_pinned():
-    assert MEDIAPIPE.requirement == "mediapipe==0.10.14"
-    assert {path.rsplit("/", 1)[-1] for path in MEDIAPIPE.files} == {PALMS, LANDMARKS, "LICENSE"}
-    assert all(len(digest) == 64 for digest in MEDIAPIPE.files.values())
