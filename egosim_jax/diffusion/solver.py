@@ -222,8 +222,8 @@ def _advance(
     return solver.step(process, state, output, coefficients, *step_keys), kept
 
 
-class EulerState(NamedTuple):
-    """Latents of the Euler solver."""
+class Latents(NamedTuple):
+    """State of a solver that keeps only the latents."""
 
     x: Float[Array, "*x"]
 
@@ -256,22 +256,22 @@ class Euler:
         columns = alpha[:-1], sigma[:-1], np.diff(sigma)
         return EulerRow(*(column.astype(np.float32) for column in columns))
 
-    def start(self, x: Float[Array, "*x"]) -> EulerState:
+    def start(self, x: Float[Array, "*x"]) -> Latents:
         """Return the noise as the first latents."""
-        return EulerState(x.astype(jnp.float32))
+        return Latents(x.astype(jnp.float32))
 
     def step(
         self,
         process: Process,
-        state: EulerState,
+        state: Latents,
         output: Float[Array, "*x"],
         row: EulerRow,
         keys: Key[Array, " b"] | None = None,
-    ) -> EulerState:
+    ) -> Latents:
         """Step along the velocity."""
         output = output.astype(jnp.float32)
         velocity = process.to_velocity(state.x, output, row.alpha, row.sigma)
-        return EulerState(state.x + row.change * velocity)
+        return Latents(state.x + row.change * velocity)
 
 
 class DDIMRow(NamedTuple):
@@ -289,12 +289,6 @@ class DDIMRow(NamedTuple):
     """Factor of the new noise, s."""
 
 
-class DDIMState(NamedTuple):
-    """Latents of the DDIM solver."""
-
-    x: Float[Array, "*x"]
-
-
 @dataclass(frozen=True, kw_only=True)
 class DDIM:
     """First-order solver on any process; the default sampler of CogVideoX."""
@@ -303,7 +297,6 @@ class DDIM:
     """Share of new noise: 0 is deterministic, 1 the ancestral sampler."""
 
     def __post_init__(self) -> None:
-        """Check the share of noise."""
         if not 0 <= self.eta <= 1:
             raise InputError(f"DDIM's eta must be between 0 and 1, not {self.eta}.")
 
@@ -326,21 +319,21 @@ class DDIM:
         )
         return DDIMRow(*columns)
 
-    def start(self, x: Float[Array, "*x"]) -> DDIMState:
+    def start(self, x: Float[Array, "*x"]) -> Latents:
         """Return the noise as the first latents."""
-        return DDIMState(at_least_float32(x))
+        return Latents(at_least_float32(x))
 
     def step(
         self,
         process: Process,
-        state: DDIMState,
+        state: Latents,
         output: Float[Array, "*x"],
         row: DDIMRow,
         keys: Key[Array, " b"] | None = None,
-    ) -> DDIMState:
+    ) -> Latents:
         """Rescale the predicted data and noise, and add new noise."""
         output = at_least_float32(output)
         data = process.to_x0(state.x, output, row.alpha, row.sigma)
         epsilon = process.to_epsilon(state.x, output, row.alpha, row.sigma)
         x = row.data * data + row.epsilon * epsilon
-        return DDIMState(x if keys is None else x + row.noise * sample_noise(keys, x))
+        return Latents(x if keys is None else x + row.noise * sample_noise(keys, x))

@@ -3,6 +3,7 @@
 import dataclasses
 
 import pytest
+from flax import nnx
 
 from egosim_jax import configs
 from egosim_jax.configs.model import Networks
@@ -63,3 +64,12 @@ def test_dwm_on_wan_has_image_tokens_of_zeros_and_no_encoder():
     assert (config.layout.channels, config.layout.mask_scale) == (52, 1.0)
     with pytest.raises(InputError, match="without an image encoder"):
         dataclasses.replace(config, image=CLIPVisionConfig())
+
+
+@pytest.mark.parametrize("name", ["debug", "dwm_tabletop"])
+def test_every_weight_names_one_logical_axis_a_dimension(name):
+    for network in Networks.abstract(configs.get(name)).parts().values():
+        for path, leaf in nnx.to_flat_state(nnx.state(network, nnx.Param)):
+            axes = leaf.get_metadata()["axes"]
+            assert len(axes) == len(leaf.shape), path
+            assert (axes[0] == "layers") == (path[0] == "blocks"), path
