@@ -111,21 +111,6 @@ def test_chunks_have_their_own_levels_and_frames_their_errors(times):
     assert float(loss) == pytest.approx(float(weighted.mean()), rel=1e-6)
 
 
-@pytest.mark.parametrize("times", TIMES)
-def test_each_sample_of_a_batch_has_its_own_level_and_noise(times):
-    x0 = jnp.zeros(SHAPE)
-    seen = []
-
-    def record(x, t):
-        seen.append(x)
-        return x
-
-    _, sampled = Objective(times=times).loss(PROCESS, record, x0, jax.random.key(3))
-    assert len(set(sampled.time.tolist())) == 3
-    unit = np.asarray(seen[0]) / np.asarray(sampled.time)[:, None, None, None, None]
-    assert np.abs(np.corrcoef(unit.reshape(3, -1)) - np.eye(3)).max() < 0.2
-
-
 def test_uniform_levels_have_the_quantiles_of_the_shifted_uniform():
     sigma = draw(Objective(times="uniform"), RectifiedFlow(shift=5.0))
     for quantile in (0.1, 0.5, 0.9):
