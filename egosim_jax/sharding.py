@@ -240,10 +240,10 @@ def shard_params(networks: Module, mesh: Mesh | None) -> Module:
     if mesh is None:
         return networks
     graph, params = nnx.split(networks, nnx.Param)
-    return nnx.merge(graph, jax.tree.map(_put, params, state_sharding(mesh, params)))
+    return nnx.merge(graph, jax.tree.map(put, params, state_sharding(mesh, params)))
 
 
-def _put(leaf: Any, sharding: Any) -> Any:
+def put(leaf: Any, sharding: Any) -> Any:
     """Place an array by a sharding; give a shape the sharding."""
     if isinstance(leaf, jax.ShapeDtypeStruct):
         return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)

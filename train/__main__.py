@@ -60,10 +60,15 @@ def main(args: Sequence[str] | None = None, *, program: str = "egosim-train") ->
     else:
         args = options
     if options[:1] == ["tabletop"] and "--online" in options:  # a training with other options
-        from egosim_jax.train.online.__main__ import main as train_online
+        from egosim_jax.train.online.command import Online
 
-        given = [option for option in options[1:] if option != "--online"]
-        return train_online(given, program=f"{program} tabletop --online")
+        return command.main(
+            Online,
+            program=f"{program} tabletop --online",
+            description="Train while other processes make scenes. The same command resumes an "
+            "interrupted run.",
+            args=[option for option in options[1:] if option != "--online"],
+        )
     from egosim_jax.train.distributed import training_context
 
     without_training = any(option.partition("=")[0] == "--preflight" for option in options)

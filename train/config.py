@@ -58,7 +58,6 @@ class OptimizerConfig:
     decay is warmed up (`ema_decay_at`)."""
 
     def __post_init__(self) -> None:
-        """Check the range of each number."""
         for name in ("learning_rate", "clip_grad_norm"):
             if getattr(self, name) <= 0:
                 raise InputError(f"{name} must be positive, not {getattr(self, name)}.")
@@ -125,7 +124,6 @@ class TrainConfig:
     """Weights & Biases project that also gets the metrics."""
 
     def __post_init__(self) -> None:
-        """Raise `InputError` unless every count is positive and the seed is in range."""
         counts = ("steps", "batch_size", "grad_accum_steps")
         every = ("log_every", "save_every", "validate_every", "sample_every", "keep_every")
         check_counts({name: getattr(self, name) for name in (*counts, *every, "keep")})
@@ -148,7 +146,6 @@ class CriticConfig:
     """Optimizer and learning-rate schedule of the critic."""
 
     def __post_init__(self) -> None:
-        """Check the number of updates."""
         check_counts({"critic.updates": self.updates})
 
 

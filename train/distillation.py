@@ -23,6 +23,7 @@ from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:
     from egosim_jax.configs.model import ModelConfig
+    from egosim_jax.models.chunks import Chunks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,12 +94,7 @@ class SelfForcing(FineTuning):
         """Return the model's config with the student's chunks and steps."""
         check_counts({"--steps": self.steps, "--first-steps": self.first_steps})
         model = super().model()
-        if model.chunks is None:
-            raise InputError(
-                f"{model.name} makes clips at once: give the latent frames of the student's "
-                "chunks. (--chunks)"
-            )
-        chunks = replace(model.chunks, first_steps=self.first_steps, refresh=self.refresh)
+        chunks = replace(student_chunks(model), first_steps=self.first_steps, refresh=self.refresh)
         return replace(model, chunks=chunks, steps=self.steps)
 
     def train(self) -> int:
@@ -127,10 +123,14 @@ def check_causal(recipe: FineTuning, file: Path) -> None:
 
     if recipe.lora is not None:
         recipe.check_lora(*recipe.require("weights"))
-    chunks = recipe.model().chunks
-    if chunks is None:
+    check_chunks(file, str(student_chunks(recipe.model())))
+
+
+def student_chunks(model: ModelConfig) -> Chunks:
+    """Return the chunks of a student. Raises `InputError` for a model of whole clips."""
+    if model.chunks is None:
         raise InputError(
-            f"{recipe.config} makes clips at once: give the latent frames of the student's "
-            "chunks. (--chunks)"
+            f"{model.name} makes clips at once: give the latent frames of the student's chunks. "
+            "(--chunks)"
         )
-    check_chunks(file, str(chunks))
+    return model.chunks

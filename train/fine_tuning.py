@@ -35,21 +35,11 @@ class FineTuning(Recipe):
         "preflight report": ("json", "search"),
         "object stores": ("cache", "cache_gb"),
         "method": (
-            "rank",
-            "lora",
-            "chunks",
-            "times",
-            "sampler_steps",
-            "max_difference",
-            "change_loss_weight",
-            "navigation",
-            "remat",
-            "attention",
-            "dtype",
-            "products",
+            "rank", "lora", "chunks", "times", "sampler_steps", "max_difference",
+            "change_loss_weight", "navigation", "remat", "attention", "dtype", "products",
             "samples",
         ),
-    }
+    }  # fmt: skip
     config: str
     """Name of the model."""
     training: TrainConfig

@@ -60,10 +60,6 @@ class FromTabletop(FromScratch):
     """DWM's conditions: static twins and meshes of hands, with human hands only."""
 
     def __post_init__(self) -> None:
-        """Raise `InputError` for held-out scenes and for rollouts that cannot be made.
-
-        Rollouts need given weights, and they have no static twins.
-        """
         if self.first_scene < FIRST_TRAINED:
             raise InputError(
                 f"Scenes of seeds below {FIRST_TRAINED} are held out: --first-scene must be at "

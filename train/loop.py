@@ -35,7 +35,14 @@ from egosim_jax.models.lora import Change, check_further, state_of
 from egosim_jax.runtime.command import CommandExit, ExitCode
 from egosim_jax.runtime.phases import phase
 from egosim_jax.runtime.terminal import printable
-from egosim_jax.sharding import assemble, batch_sharding, make_mesh, parts, process_rows
+from egosim_jax.sharding import (
+    assemble,
+    batch_sharding,
+    make_mesh,
+    parts,
+    process_rows,
+    put,
+)
 from egosim_jax.train.config import TrainConfig, numerics_only, resume_mutable
 from egosim_jax.train.distributed import (
     count_distinct,
@@ -179,7 +186,7 @@ class Run:
                     changed = state_of(lora, self.programs.state.params, base)
                     loaded = nnx.merge_state(base, changed)
                 return self._initial_state(loaded, teacher)
-            state = _placed(self.programs.state, self.programs.state_sharding)
+            state = jax.tree.map(put, self.programs.state, self.programs.state_sharding)
             return self.checkpoints.restore(state, self.batches, fallback=self.training.fallback)
 
     def open_log(self, step: int) -> None:
@@ -393,10 +400,3 @@ def startup_message(state: TrainState, training: TrainConfig, out: Path) -> str:
     verb = f"resuming at step {step}" if step else "starting"
     devices = f"{jax.device_count()} x {jax.devices()[0].device_kind}"
     return f"{out}: {verb} of {training.steps}, {weights:,} weights to train, {devices}"
-
-
-def _placed(abstract: Any, sharding: Any) -> Any:
-    def place(leaf: jax.ShapeDtypeStruct, where: Any) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=where)
-
-    return jax.tree.map(place, abstract, sharding)

@@ -234,7 +234,6 @@ class Samples:
     """Number of clips to generate."""
 
     def __post_init__(self) -> None:
-        """Raise `InputError` unless there is at least one clip."""
         check_counts({"--samples": self.count})
 
     def write(self, networks: nnx.Module, out: Path, step: int) -> None:

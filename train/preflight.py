@@ -123,7 +123,9 @@ def _others(stage: Stage, target: Target, asked: Report | OutOfMemory) -> dict[S
         shared = stage._replace(training=replace(stage.training, mesh=mesh))
         fitting = _fitting(shared, target, known)
         if fitting:
-            return dict(sorted(fitting.items(), key=lambda item: _order(item[1])))
+            # By the seconds at the devices' peak, then by peak memory.
+            reports = fitting.items()
+            return dict(sorted(reports, key=lambda item: (item[1].roofline_s, item[1].memory.peak)))
     return {}
 
 
@@ -167,11 +169,6 @@ def _fitting(
     for _ in track(tries(), f"compiling other settings{shared}", total=len(counts) * len(levels)):
         pass
     return fitting
-
-
-def _order(report: Report) -> tuple[float, int]:
-    """Return the sort key: seconds at the devices' peak, then peak memory."""
-    return report.roofline_s, report.memory.peak
 
 
 def _heading(title: str, stage: Stage, target: Target) -> str:

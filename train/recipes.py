@@ -1,4 +1,7 @@
-"""Named trainings: the fields of each value are the options of `egosim-train NAME`."""
+"""Named trainings: the fields of each value are the options of `egosim-train NAME`.
+
+docs/train.md and docs/dwm.md have the commands before and after each.
+"""
 
 from __future__ import annotations
 
@@ -26,13 +29,7 @@ _FULL = TrainConfig(
 )
 
 EGOSIM_14B = FineTuning(config="egosim_14b", training=_FULL)
-r"""EgoSim's main training: the whole 14B transformer, from Wan 2.1 Fun InP 14B widened to 52.
-
-    egosim-convert weights Wan2.1-Fun-14B-InP --config egosim_14b --widen polarity \
-        --out weights/base
-    egosim data encode --config egosim_14b --weights weights/base --shards shards/train \
-        --out latents/train
-    egosim-train egosim_14b --weights weights/base --latents latents/train --out runs/egosim_14b
+"""EgoSim's main training: the whole 14B transformer, from Wan 2.1 Fun InP 14B widened to 52.
 
 AdamW at 1e-5, batch size 32, clips of 61 frames of 832 x 480, 4000 updates, as in the paper
 (section 4.1). Weights and moments take 197 GB. 8 x H200 share them by FSDP: about 31 GiB each with
@@ -42,13 +39,7 @@ one H200 reached 45 % with 16 of the 40 blocks (docs/gpu.md).
 """
 
 EGOSIM_1_3B = FineTuning(config="egosim_1_3b", training=_FULL)
-r"""EgoSim's conditioning on the 1.3B transformer, from Wan 2.1 Fun InP 1.3B widened to 52 channels.
-
-    egosim-convert weights Wan2.1-Fun-1.3B-InP --config egosim_1_3b --widen polarity \
-        --out weights/base
-    egosim data encode --config egosim_1_3b --weights weights/base --shards shards/train \
-        --out latents/train
-    egosim-train egosim_1_3b --weights weights/base --latents latents/train --out runs/egosim_1_3b
+"""EgoSim's conditioning on the 1.3B transformer, from Wan 2.1 Fun InP 1.3B widened to 52 channels.
 
 Weights and moments of 1.6 billion parameters take 19 GB: one H200 is enough, and eight share them.
 It needs a tenth of the FLOPs of the 14B. Estimated, not measured.
@@ -66,10 +57,7 @@ EGOSIM_14B_ROBOT = FineTuning(
         sample_every=100,
     ),
 )
-r"""EgoSim's cross-embodiment training: from human hands to a robot's gripper.
-
-    egosim-train egosim_14b_robot --weights weights/egosim_14b --latents latents/agibot \
-        --out runs/robot
+"""EgoSim's cross-embodiment training: from human hands to a robot's gripper.
 
 200 updates of 32 clips after the main training, as in the paper (section 4.1). Hardware and memory
 as for `egosim_14b`; two hours at 40 % of the peak. Estimated, not measured.
@@ -87,10 +75,7 @@ EGOSIM_14B_FEWSHOT = FineTuning(
         sample_every=25,
     ),
 )
-r"""EgoSim's adaptation to a new wearer or place, from a few dozen clips.
-
-    egosim-train egosim_14b_fewshot --weights weights/egosim_14b --latents latents/mine \
-        --out runs/mine
+"""EgoSim's adaptation to a new wearer or place, from a few dozen clips.
 
 50 updates of one clip per device on 30 clips, as in the paper (section 4.1). 8 x H200 need about
 62 GiB each and a few minutes; with another number of devices, set `--training.batch-size` to it.
@@ -141,13 +126,7 @@ DWM_COGVIDEOX_5B = FineTuning(
         sample_every=500,
     ),
 )
-r"""DWM's training: a LoRA of CogVideoX-Fun V1.1 5B InP, widened from 33 to 49 channels.
-
-    egosim-convert weights CogVideoX-Fun-V1.1-5b-InP --config dwm_cogvideox_5b \
-        --widen polarity --out weights/base
-    egosim data encode --config dwm_cogvideox_5b --weights weights/base --shards shards/train \
-        --out latents/train
-    egosim-train dwm_cogvideox_5b --weights weights/base --latents latents/train --out runs/dwm
+"""DWM's training: a LoRA of CogVideoX-Fun V1.1 5B InP, widened from 33 to 49 channels.
 
 AdamW (0.9, 0.95) at 1e-4 trains a LoRA of rank and alpha 64 on queries, keys, values and outputs,
 and the patch projection: 66.7 million float32 weights. 56 clips of 49 frames per update, 8000
@@ -169,12 +148,9 @@ DWM_WAN_14B = replace(
         optimizer=replace(DWM_COGVIDEOX_5B.training.optimizer, b2=OptimizerConfig.b2),
     ),
 )
-r"""DWM's training on Wan 2.1 Fun V1.1 14B InP, widened from 36 to 52 channels.
+"""DWM's training on Wan 2.1 Fun V1.1 14B InP, widened from 36 to 52 channels.
 
-    egosim-convert weights Wan2.1-Fun-V1.1-14B-InP --config dwm_wan_14b --widen polarity \
-        --out weights/base
-
-and then as `dwm_cogvideox_5b`. It trains a LoRA of rank and alpha 64 on all 488 linear layers, and
+It trains a LoRA of rank and alpha 64 on all 488 linear layers, and
 the patch embedding; 5000 updates, as in the released checkpoint. Like its trainer, it ignores
 elements whose prediction is more than 50 away from the target. One clip at a time takes 59 GiB of
 an H100 (`--preflight h100:1`).

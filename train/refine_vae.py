@@ -1,13 +1,4 @@
-"""Further training of the video VAE of given weights, optionally with a wider decoder.
-
-A wider decoder at first computes what the narrow one does. New channels are 0 everywhere, because
-no layer writes to them. Layers read them with random weights: from the first update on, gradients
-reach the layers that write to them. Two operations depend on the number of channels, n instead of
-m, and the weights compensate:
-
-    RMS norm      x / sqrt(sum x^2 / n) grows by sqrt(n / m)   scale  * sqrt(m / n)
-    attention     q k / sqrt(n) shrinks by sqrt(m / n)         q      * sqrt(n / m)
-"""
+"""Further training of the video VAE of given weights."""
 
 from __future__ import annotations
 
@@ -16,12 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-import numpy as np
-
 from egosim_jax import configs
 from egosim_jax.io import weights
-from egosim_jax.io.mapped import read_safetensors
-from egosim_jax.models import VideoCodecConfig, abstract
 from egosim_jax.runtime.command import ExitCode, HelpGroups
 from egosim_jax.runtime.terminal import print_line
 from egosim_jax.train.config import TrainConfig, WeightsDtype, resume_mutable
@@ -32,15 +19,11 @@ from egosim_jax.train.task import Stage
 if TYPE_CHECKING:
     from egosim_jax.train.tasks.refining import Refining
 
-PARTS = {"qkv": 3, "time": 2}
-"""Number of equal parts of a layer's output channels by its name, default 1; each part grows."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class RefineVAE(Recipe):
     """Train the VAE of a weights folder further, all of it or its decoder.
 
-    A decoder that is narrower than the model's is widened first, which does not change its output.
     Writes OUT/weights, with the other networks of the folder, and log and checkpoints to OUT/vae.
     """
 
@@ -109,7 +92,6 @@ class RefineVAE(Recipe):
         require_single_process(self.config)
         free = [*resume_mutable("vae"), "preflight", "json", "search"]
         open_folder(out, self, mutable=free, begun=has_checkpoint(out / "vae"))
-        start = widen_decoder(configs.get(self.config).vae, start, out / "start")
         vae = train(
             *self.stages()["vae"],
             data=frames / "train",
@@ -125,53 +107,3 @@ class RefineVAE(Recipe):
         weights.add_others(folder, start)
         print_line(folder)
         return ExitCode.DONE
-
-
-def widen_decoder(config: VideoCodecConfig, folder: Path, out: Path) -> Path:
-    """Return a weights folder whose VAE has the config's decoder.
-
-    It is `folder` if the decoder fits, else OUT, with the decoder widened. Raises `WeightsError` if
-    more than the decoder's width differs.
-    """
-    file, vae = folder / "vae.safetensors", abstract(config)
-    narrow = {name: tensor.array() for name, tensor in read_safetensors(file).items()}
-    shapes = weights.flat_shapes(vae)
-    if not weights.mismatches(narrow, shapes):
-        return folder
-    draw = np.random.default_rng(0)
-    wider = {
-        name: _widen(name, value, shapes[name], draw)
-        for name, value in narrow.items()
-        if name.startswith("decoder.") and value.ndim == len(shapes.get(name, ()))
-    }
-    weights.fill(vae, {**narrow, **wider}, dtype="float32", source=str(file))
-    weights.save(out / file.name, vae)
-    weights.add_others(out, folder)
-    return out
-
-
-def _widen(
-    name: str,
-    narrow: np.ndarray,
-    shape: tuple[int, ...],
-    draw: np.random.Generator,
-) -> np.ndarray:
-    """Return a parameter of the wider decoder, in float32."""
-    *_, layer, kind = name.split(".")
-    few, many = narrow.shape[-1], shape[-1]
-    if kind == "scale":
-        scale = np.ones(many, np.float32)
-        scale[:few] = narrow * np.sqrt(few / many)
-        return scale
-    wide = np.zeros(shape, np.float32)
-    parts = PARTS.get(layer, 1)
-    outputs = np.arange(many).reshape(parts, -1)[:, : few // parts].ravel()
-    if kind == "bias":
-        wide[outputs] = narrow
-    else:
-        read = (*shape[:-1], few)
-        wide[..., outputs] = draw.normal(size=read) / np.sqrt(np.prod(shape[:-1]))
-        wide[..., : narrow.shape[-2], outputs] = narrow
-    if layer == "qkv":
-        wide[..., : many // parts] *= np.sqrt(many / few)
-    return wide

@@ -5,7 +5,8 @@
     student_dmd    self-forcing: own clips, regression and distribution matching
 
 The rates and numbers of updates of EgoSim's stages follow Casual-EgoSim's configs. Costs are
-estimates: the preflight's FLOPs at 40 % of the devices' peak.
+estimates: the preflight's FLOPs at 40 % of the devices' peak. docs/streaming.md has the commands,
+also for LoRAs on one H200.
 """
 
 from __future__ import annotations
@@ -38,32 +39,18 @@ _CHANGE = 4.0
 """Loss weight of hands and moved objects, which a student blurs first."""
 
 EGOSIM_14B_AR = FineTuning(config="egosim_14b", chunks=_CHUNKS, training=_AR)
-r"""Teacher forcing of EgoSim's 14B transformer, chunks of 4 latent frames.
-
-    egosim-train egosim_14b_student_ar --weights weights/egosim_14b --latents latents/train \
-        --out runs/student_ar
+"""Teacher forcing of EgoSim's 14B transformer, chunks of 4 latent frames.
 
 All weights on 8 x H200. 1000 updates of 32 clips are 6.3e20 model FLOPs: 56 hours at 40 % of the
-peak. Estimated, not measured. On one H200, train a LoRA; the later stages train it further:
-
-    egosim-train egosim_14b_student_ar --rank 64 --training.optimizer.learning-rate 1e-4 \
-        --training.grad-accum-steps 32 --weights weights/egosim_14b --latents latents/train \
-        --out runs/student_ar
+peak. Estimated, not measured.
 """
 
 EGOSIM_14B_CD = ConsistencyDistillation(
     config="egosim_14b", chunks=_CHUNKS, training=_CD, change_loss_weight=_CHANGE
 )
-r"""Consistency distillation of the student of `egosim_14b_student_ar`, which is its teacher.
+"""Consistency distillation of the student of `egosim_14b_student_ar`, which is its teacher.
 
-    egosim-train egosim_14b_student_cd --weights runs/student_ar/weights --latents latents/train \
-        --out runs/student_cd
-
-Student, moving average and teacher are three copies of the weights on 8 x H200. On one H200:
-
-    egosim-train egosim_14b_student_cd --rank 64 --lora runs/student_ar/lora.safetensors \
-        --training.optimizer.learning-rate 1e-4 --training.grad-accum-steps 32 \
-        --weights weights/egosim_14b --latents latents/train --out runs/student_cd
+Student, moving average and teacher are three copies of the weights on 8 x H200.
 """
 
 EGOSIM_14B_DMD = SelfForcing(
@@ -75,25 +62,14 @@ EGOSIM_14B_DMD = SelfForcing(
     critic=_CRITIC,
     change_loss_weight=_CHANGE,
 )
-r"""Self-forcing of the student of `egosim_14b_student_cd`, with EgoSim-14B as teacher.
-
-    egosim-train egosim_14b_student_dmd --weights runs/student_cd/weights \
-        --teacher weights/egosim_14b --latents latents/train --validation latents/test \
-        --out runs/student_dmd
+"""Self-forcing of the student of `egosim_14b_student_cd`, with EgoSim-14B as teacher.
 
 120 updates of the student, each after five of the critic. On 8 x H200, two devices share a clip:
 125.5 of 133.3 GiB (`--preflight h200:8`). Four denoising steps of the first chunk
 and two of the others, whose last keys later chunks see. Stop when LPIPS of held-out clips no longer
 falls (`egosim generate` with the kept checkpoints, `egosim evaluate`). On one H200, three LoRAs
-share one frozen base:
-
-    egosim-train egosim_14b_student_dmd --rank 64 --lora runs/student_cd/lora.safetensors \
-        --training.optimizer.learning-rate 1e-4 --critic.optimizer.learning-rate 2e-5 \
-        --training.grad-accum-steps 32 --training.mesh.context 1 --weights weights/egosim_14b \
-        --latents latents/train --out runs/student_dmd
-
-They take 124.5 GiB, and an update has 1.0e18 model FLOPs (`--preflight h200:1`): 120 updates are 86
-hours at 40 % of the peak. Estimated, not measured.
+share one frozen base. They take 124.5 GiB, and an update has 1.0e18 model FLOPs (`--preflight
+h200:1`): 120 updates are 86 hours at 40 % of the peak. Estimated, not measured.
 """
 
 EGOSIM_1_3B_AR = replace(EGOSIM_14B_AR, config="egosim_1_3b")
@@ -125,12 +101,9 @@ TABLETOP_AR = FineTuning(
     change_loss_weight=2.0,
     training=_SMALL,
 )
-r"""Teacher forcing of `tabletop` as a LoRA, on latents of `egosim-train tabletop`.
+"""Teacher forcing of `tabletop` as a LoRA, on latents of `egosim-train tabletop` and a CPU core.
 
-    egosim-train tabletop_student_ar --weights egosim_jax/weights/tabletop \
-        --latents runs/tabletop/latents/train --out runs/student_ar
-
-runs on a CPU core. Half of the noise levels are those that a sampler of two steps visits.
+Half of the noise levels are those that a sampler of two steps visits.
 """
 
 TABLETOP_CD = ConsistencyDistillation(
@@ -141,12 +114,7 @@ TABLETOP_CD = ConsistencyDistillation(
     change_loss_weight=2.0,
     training=_SMALL,
 )
-r"""Consistency distillation of the student of `tabletop_student_ar`.
-
-    egosim-train tabletop_student_cd --weights egosim_jax/weights/tabletop \
-        --lora runs/student_ar/lora.safetensors --latents runs/tabletop/latents/train \
-        --out runs/student_cd
-"""
+"""Consistency distillation of the student of `tabletop_student_ar`."""
 
 TABLETOP_DMD = SelfForcing(
     config="tabletop",
@@ -159,10 +127,7 @@ TABLETOP_DMD = SelfForcing(
     training=_SMALL,
     critic=CriticConfig(optimizer=OptimizerConfig(learning_rate=2e-4)),
 )
-r"""Self-forcing of a student of `tabletop`, by regression alone.
-
-    egosim-train tabletop_student_dmd --weights egosim_jax/weights/tabletop \
-        --latents runs/tabletop/latents/train --out runs/student
+"""Self-forcing of a student of `tabletop`, by regression alone.
 
 It needs no earlier stage. `--matching 1 --regression 0.25` adds teacher and critic.
 """

@@ -145,13 +145,17 @@ def make_update(
 
 def advance(
     state: TrainState,
-    loss: Callable[[nnx.State, Batch, jax.Array], tuple[jax.Array, Metrics]],
-    batch: Batch,
+    loss: Callable[[nnx.State, Any, jax.Array], tuple[jax.Array, Metrics]],
+    batch: Any,
     keys: Key[Array, " *keys"],
     training: TrainConfig,
+    rate: jax.Array | None = None,
 ) -> tuple[TrainState, Metrics]:
-    """Return the state after an update by the gradient of `loss`, and the metrics."""
-    config, schedule = training.optimizer, learning_rate(training.optimizer, training.steps)
+    """Return the state after an update by the gradient of `loss`, and the metrics.
+
+    Without a `rate`, the learning rate follows the schedule.
+    """
+    config = training.optimizer
     gradient = jax.value_and_grad(loss, has_aux=True)
     if training.grad_accum_steps > 1:
         gradient = accumulate_gradients(gradient, training.grad_accum_steps)
@@ -162,8 +166,9 @@ def advance(
     if config.skip_grad_norm_factor is not None:
         limit = config.skip_grad_norm_factor * state.grad_norm_ema
         valid &= (state.step < GUARD_WARMUP) | (norm <= limit)
-    # The optimizer's own count would lag behind: it does not count skipped updates.
-    rate = jnp.asarray(schedule(state.step), jnp.float32)
+    if rate is None:
+        # The optimizer's own count would lag behind: it does not count skipped updates.
+        rate = jnp.asarray(learning_rate(config, training.steps)(state.step), jnp.float32)
     changed = state.apply_gradients(gradients, norm, rate, training)
     # `where` drops the NaNs of a bad update: the optimizer state stays finite, too.
     state = jax.tree.map(lambda new, old: jnp.where(valid, new, old), changed, state.skip_update())

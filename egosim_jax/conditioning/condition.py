@@ -87,7 +87,6 @@ class ConditionDropout:
     """Dropout rate of the prompt."""
 
     def __post_init__(self) -> None:
-        """Check that the rates are probabilities."""
         for field in fields(self):
             rate = getattr(self, field.name)
             if not 0 <= rate <= 1:

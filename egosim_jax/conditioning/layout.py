@@ -53,7 +53,6 @@ class ChannelLayout:
     """Multiply the prior's latents by 0 where the first mask channel says generate."""
 
     def __post_init__(self) -> None:
-        """Check that the noisy latents come first, every part once, with enough channels."""
         names = [name for name, _ in self.parts]
         if unknown := [name for name in names if name not in get_args(Part)]:
             raise InputError(
@@ -161,8 +160,6 @@ COGVIDEOX_INPAINT = ChannelLayout(
     mask_prior=False,
 )
 """CogVideoX-Fun V1.1 InP: 33 channels; the prior is masked in pixels."""
-WAN_TEXT = ChannelLayout(parts=(("noisy", 16),))
-"""Wan 2.1 text to video: 16 channels."""
 WAN_INPAINT = ChannelLayout(
     parts=(("noisy", 16), ("mask", 4), ("prior", 16)),
     mask_packing="time",

@@ -12,9 +12,6 @@ Wan 2.1 inpainting models use the opposite. For a mask video of the model's size
 4. Each 2 x 2 block of the remaining pixels becomes four channels, channel 2 dh + dw, so that
    latent cell (i, j) holds the pixels (8i + 4dh, 8j + 4dw).
 
-The release's continuous runner omits the padding of rule 3, so that its 61 frames are selected as
-floor(61 i / 16) = 0, 3, 7, 11, 15, 19, ...; `padding="none"` reproduces it.
-
 These are the rules of the packing `space` with a codec of strides 4 and 8. `single` and `time` keep
 rules 1 and 2 and take one pixel of each latent cell. `single` takes it from the same frame, in one
 channel. `time` takes it from every pixel frame that the latent frame encodes, in one channel each
@@ -41,7 +38,6 @@ def pack_mask(
     packing: Packing = "space",
     channels: int = 4,
     grid: VideoGrid = WAN_GRID,
-    padding: Literal["to-4f+1", "none"] = "to-4f+1",
 ) -> UInt8[np.ndarray, "lf lh lw {channels}"]:
     """Return mask channels, 0 or 1, of a gray mask video (255 = not observed).
 
@@ -66,11 +62,9 @@ def pack_mask(
         generate = frames[selected, ::space, ::space] > HALF_WHITE
         generate = rearrange(generate, "f t h w -> f h w t")
     else:
-        source_frames = count if padding == "none" else time * latent_frames + 1
-        # The repeated frames themselves are never selected: 4 (f - 1) is the clip's last frame.
-        selected = np.arange(latent_frames) * source_frames // latent_frames
+        # Rule 3: the frames that the release repeats are never selected.
         side = 2 if packing == "space" else 1
-        generate = frames[selected, :: space // side, :: space // side] > HALF_WHITE
+        generate = frames[::time, :: space // side, :: space // side] > HALF_WHITE
         generate = rearrange(generate, "f (h i) (w j) -> f h w (i j)", i=side, j=side)
     generate[0] = False
     return generate.astype(np.uint8)

@@ -48,7 +48,6 @@ class EncodingNoise:
     """Deviation of the noise on the prior's pixels in [-1, 1]; black ones get none."""
 
     def __post_init__(self) -> None:
-        """Check that the deviation is not negative."""
         if not self.prior_pixels >= 0:
             raise InputError(f"prior_pixels must be at least 0, not {self.prior_pixels}.")
 

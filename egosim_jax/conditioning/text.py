@@ -64,7 +64,6 @@ class PromptTokenizer:
     """Tokens that every prompt is padded or cut to, the end token included."""
 
     def __post_init__(self) -> None:
-        """Check that the end token fits."""
         if self.max_tokens < 1:
             raise InputError(
                 f"max_tokens {self.max_tokens} leaves no room for the end token: it must be at "

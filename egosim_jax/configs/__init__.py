@@ -61,10 +61,8 @@ def sampled(config: ModelConfig, sampling: str) -> ModelConfig:
             "(--sampling)"
         )
     if sampling not in known:
-        near = difflib.get_close_matches(sampling, known, n=1, cutoff=0.0)
         raise InputError(
-            f"{config.name} has no sampling {sampling!r}. Nearest: {near[0]}. All: "
-            f"{', '.join(known)}. (--sampling)"
+            f"{config.name} has no sampling {sampling!r}. {_nearest(sampling, known)} (--sampling)"
         )
     return replace(config, **known[sampling])
 
@@ -76,12 +74,14 @@ def allows_random_weights(name: str) -> bool:
 
 def _module(name: str) -> ModuleType:
     if name not in names():
-        near = difflib.get_close_matches(name, names(), n=1, cutoff=0.0)
-        raise InputError(
-            f"There is no config {name!r}. Nearest: {near[0]}. All: {', '.join(names())}. "
-            "(--config)"
-        )
+        raise InputError(f"There is no config {name!r}. {_nearest(name, names())} (--config)")
     return importlib.import_module(f"{__name__}.{name}")
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    """Return the nearest of several names, and all of them, for a message."""
+    near = difflib.get_close_matches(name, known := list(known), n=1, cutoff=0.0)
+    return f"Nearest: {near[0]}. All: {', '.join(known)}."
 
 
 def shipped_weights(name: str) -> Path | None:
@@ -110,10 +110,9 @@ def release(name: str, *, others: Iterable[str] = ()) -> hub.Release:
     if name not in known and (shipped := shipped_weights(name)):
         raise InputError(f"{name} is in the package, so nothing is fetched: {shipped}.")
     if name not in known:
-        near = difflib.get_close_matches(name, [*known, *others], n=1, cutoff=0.0)
         raise InputError(
-            f"There are no released weights {name!r}. Nearest: {near[0]}. All: "
-            f"{', '.join([*known, *others])}. (egosim models list)"
+            f"There are no released weights {name!r}. {_nearest(name, [*known, *others])} "
+            "(egosim models list)"
         )
     return known[name]
 

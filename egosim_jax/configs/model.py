@@ -116,7 +116,6 @@ class ModelConfig:
     """Chunks that the denoiser makes one after the other, a causal student; None: all at once."""
 
     def __post_init__(self) -> None:
-        """Check that networks, input channels and video fit each other."""
         check_counts({"point_px": self.point_px})
         dit, layout, latents = self.dit, self.layout, self.vae.latent_channels
         pairs = [

@@ -53,7 +53,6 @@ class StepCache:
     """Number of steps at the start that always run the network; the last step always does."""
 
     def __post_init__(self) -> None:
-        """Raise `InputError` for a threshold or a number of steps out of range."""
         if not 0 < self.threshold < 1:
             raise InputError(
                 f"{self.threshold:g} is no threshold of reused steps: it must be above 0 and below "

@@ -33,7 +33,6 @@ class Guidance:
     """Lowest and highest timestep that is guided, of 0 (data) to 1000 (noise); None: all."""
 
     def __post_init__(self) -> None:
-        """Raise `InputError` for an empty interval, or one outside of the timesteps."""
         if self.interval is None:
             return
         low, high = self.interval

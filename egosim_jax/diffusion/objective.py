@@ -66,7 +66,6 @@ class Objective:
     """Difference from the target above which an element's error counts as 0; None: no limit."""
 
     def __post_init__(self) -> None:
-        """Check the width of the logit-normal, the sampler's steps and the bound of differences."""
         check_counts({"sampler_steps": self.sampler_steps})
         if self.sampler_steps is not None and self.times == "diffsynth":
             raise InputError(

@@ -182,7 +182,6 @@ class RectifiedFlow(Process):
     """Quantity that the network predicts: `velocity`, `epsilon` or `x0`."""
 
     def __post_init__(self) -> None:
-        """Check the shift, the range and the prediction type."""
         if not self.shift > 0:
             raise InputError(f"shift must be above 0, not {self.shift}; 1 means no shift.")
         if not 0 <= self.sigma_min < self.sigma_max <= 1:
@@ -272,7 +271,6 @@ class VariancePreserving(Process):
     """Quantity that the network predicts: `v`, `epsilon` or `x0`."""
 
     def __post_init__(self) -> None:
-        """Check the betas, the shift and the prediction type."""
         if not 0 < self.beta_start <= self.beta_end < 1:
             raise InputError(
                 "the betas must satisfy 0 < beta_start <= beta_end < 1, not "

@@ -223,8 +223,8 @@ def _advance(
     return solver.step(process, state, output, coefficients, *step_keys), kept
 
 
-class EulerState(NamedTuple):
-    """Latents of the Euler solver."""
+class Latents(NamedTuple):
+    """State of a solver that keeps only the latents."""
 
     x: Float[Array, "*x"]
 
@@ -257,22 +257,22 @@ class Euler:
         columns = alpha[:-1], sigma[:-1], np.diff(sigma)
         return EulerRow(*(column.astype(np.float32) for column in columns))
 
-    def start(self, x: Float[Array, "*x"]) -> EulerState:
+    def start(self, x: Float[Array, "*x"]) -> Latents:
         """Return the noise as the first latents."""
-        return EulerState(x.astype(jnp.float32))
+        return Latents(x.astype(jnp.float32))
 
     def step(
         self,
         process: Process,
-        state: EulerState,
+        state: Latents,
         output: Float[Array, "*x"],
         row: EulerRow,
         keys: Key[Array, " b"] | None = None,
-    ) -> EulerState:
+    ) -> Latents:
         """Step along the velocity."""
         output = output.astype(jnp.float32)
         velocity = process.to_velocity(state.x, output, row.alpha, row.sigma)
-        return EulerState(state.x + row.change * velocity)
+        return Latents(state.x + row.change * velocity)
 
 
 class DDIMRow(NamedTuple):
@@ -290,12 +290,6 @@ class DDIMRow(NamedTuple):
     """Factor of the new noise, s."""
 
 
-class DDIMState(NamedTuple):
-    """Latents of the DDIM solver."""
-
-    x: Float[Array, "*x"]
-
-
 @dataclass(frozen=True, kw_only=True)
 class DDIM:
     """First-order solver on any process; the default sampler of CogVideoX."""
@@ -304,7 +298,6 @@ class DDIM:
     """Share of new noise: 0 is deterministic, 1 the ancestral sampler."""
 
     def __post_init__(self) -> None:
-        """Check the share of noise."""
         if not 0 <= self.eta <= 1:
             raise InputError(f"DDIM's eta must be between 0 and 1, not {self.eta}.")
 
@@ -331,24 +324,24 @@ class DDIM:
         """Return the share of the variance that is new, of steps with these ratios e^-h."""
         return self.eta**2 * (1 - ratio**2)
 
-    def start(self, x: Float[Array, "*x"]) -> DDIMState:
+    def start(self, x: Float[Array, "*x"]) -> Latents:
         """Return the noise as the first latents."""
-        return DDIMState(at_least_float32(x))
+        return Latents(at_least_float32(x))
 
     def step(
         self,
         process: Process,
-        state: DDIMState,
+        state: Latents,
         output: Float[Array, "*x"],
         row: DDIMRow,
         keys: Key[Array, " b"] | None = None,
-    ) -> DDIMState:
+    ) -> Latents:
         """Rescale the predicted data and noise, and add new noise."""
         output = at_least_float32(output)
         data = process.to_x0(state.x, output, row.alpha, row.sigma)
         epsilon = process.to_epsilon(state.x, output, row.alpha, row.sigma)
         x = row.data * data + row.epsilon * epsilon
-        return DDIMState(x if keys is None else x + row.noise * sample_noise(keys, x))
+        return Latents(x if keys is None else x + row.noise * sample_noise(keys, x))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -86,7 +86,6 @@ class UniPC:
     stochastic = False
 
     def __post_init__(self) -> None:
-        """Check the order of the UniPC solver."""
         if self.order < 1:
             raise InputError(f"UniPC's order must be at least 1, not {self.order}; take 2 or 3.")
 

@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ from egosim_jax.conditioning.condition import Condition
 from egosim_jax.conditioning.condition import Name as ConditionName
 from egosim_jax.conditioning.pixels import to_model, to_uint8
 from egosim_jax.configs.model import ModelConfig
-from egosim_jax.generation.causal import ChunkDenoiser, chunks_of
+from egosim_jax.generation.causal import chunks_of
 from egosim_jax.generation.compiled import CompiledFn
 from egosim_jax.generation.encoding import last_32_bits, pack_clip, pack_videos, video_shapes
 from egosim_jax.sharding import fetch, parts
@@ -122,56 +122,11 @@ class CodecPrograms:
             yield "decode 2", self._decode, (latents, self._decode.shapes(latents, cache)[1])
 
 
-@runtime_checkable
-class Programs(Protocol):
-    """Compiled programs of a model (`generator.Generator`)."""
-
-    config: ModelConfig
-    """Config of the model."""
-    mesh: Mesh | None
-    """Mesh of the devices."""
-    encode: CompiledFn
-    """Encoder of conditions."""
-    decode: CompiledFn
-    """Decoder of whole clips."""
-    codec: CodecPrograms | None
-    """Coding of pieces of a clip; None if the codec is not causal."""
-    denoiser: ChunkDenoiser | None
-    """Denoising of chunks; None for a model that makes clips at once."""
-
-    def noise(self, seeds: Sequence[int]) -> Float[Array, "b f h w z"]:
-        """Return the initial noise of each seed."""
-        ...
-
-    def latents(
-        self,
-        triplets: Sequence[Triplet],
-        seeds: Sequence[int],
-        *,
-        without: ConditionName | None = None,
-    ) -> Float[Array, "b f h w z"]:
-        """Return the latents of whole clips."""
-        ...
-
-    def condition(
-        self,
-        view: View,
-        action: Action,
-        first_frame: UInt8[np.ndarray, "h w 3"],
-        *,
-        chunk: int | None = None,
-    ) -> Triplet:
-        """Return the conditions of a chunk of a simulation's clip, by index."""
-        ...
-
-
 class ClipStream:
     """One clip for each seed, chunk by chunk: conditions in (`put`), frames out (`take`)."""
 
-    def __init__(
-        self, generator: Programs, seeds: Sequence[int], without: ConditionName | None = None
-    ):
-        """Begin clips; `without` drops one condition (`conditioning/condition.py`)."""
+    def __init__(self, generator: Any, seeds: Sequence[int], without: ConditionName | None = None):
+        """Begin clips of a `Generator`; `without` drops one condition (`ConditionDropout`)."""
         self._generator, self._seeds = generator, seeds
         self._without: ConditionName | None = without
         self._names: list[str] = []
@@ -238,7 +193,7 @@ class ClipStream:
         self, clip: Condition, noise: Float[Array, "b f h w z"]
     ) -> Iterator[Float[Array, "b f h w c"]]:
         """Yield the condition channels of each chunk, from the triplets that were put."""
-        config, codec = self._generator.config, cast(CodecPrograms, self._generator.codec)
+        config, codec = self._generator.config, self._generator.codec
         caches = None
         for start, end in pairwise(chunks_of(config).bounds):
             videos = pack_videos(self._given.popleft(), config, continued=start > 0)
@@ -268,7 +223,8 @@ class ViewStream:
     On a mesh whose devices share a batch, all of them make the same clip.
     """
 
-    def __init__(self, generator: Programs, first_frame: UInt8[np.ndarray, "h w 3"], seed: int):
+    def __init__(self, generator: Any, first_frame: UInt8[np.ndarray, "h w 3"], seed: int):
+        """Begin a clip of a `Generator`."""
         self._generator, self._first_frame = generator, first_frame
         self._copies = 1 if generator.mesh is None else parts("batch", generator.mesh)
         self._clips = ClipStream(generator, [seed] * self._copies)

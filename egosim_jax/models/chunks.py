@@ -25,7 +25,6 @@ class Chunks:
     Without it, later chunks see the keys and values of the chunk's last denoising step."""
 
     def __post_init__(self) -> None:
-        """Check that there are chunks, and that none is empty."""
         if not self.sizes:
             raise InputError("A causal denoiser needs at least one chunk. (chunks.sizes)")
         check_counts({f"chunks.sizes[{n}]": size for n, size in enumerate(self.sizes)})

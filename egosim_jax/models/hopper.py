@@ -23,9 +23,9 @@ import jax.numpy as jnp
 from jax import lax
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import mosaic_gpu as gpu
-from jaxtyping import Array, Float
 
 from egosim_jax.models import flash
+from egosim_jax.models.flash import Keys, Queries
 
 ROWS = 64
 """Queries of a warpgroup: the height of Hopper's matrix instructions."""
@@ -39,9 +39,6 @@ MANY_KEYS = 8 * BLOCK
 """Number of keys from which the kernel is faster than cuDNN, despite filling its pipeline."""
 REGISTERS = {"computing": 240, "fetching": 24}
 """Registers of a thread, by the kind of its warpgroup."""
-
-Queries = Float[Array, "b n h k"]
-Keys = Float[Array, "b m h k"]
 
 
 def attend(q: Queries, k: Keys, v: Keys, *, scale: float) -> Queries:

@@ -6,6 +6,8 @@ step, is computed once.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 from einops import rearrange
 from flax import nnx
@@ -17,21 +19,14 @@ from egosim_jax.types import InputError
 class PatchEmbedding(nnx.Module):
     """Linear embedding of each patch, with a kernel `[channel, row, column, out]`."""
 
-    def __init__(
-        self,
-        in_channels: int,
-        dim: int,
-        *,
-        noisy_channels: int,
-        patch: int,
-        dtype: str,
-        rngs: nnx.Rngs,
-    ):
-        shape = (in_channels, patch, patch, dim)
+    def __init__(self, config: Any, *, patch: int, rngs: nnx.Rngs):
+        """Take the channels, the width and the dtype of a denoiser's config."""
+        shape = (config.in_channels, patch, patch, config.dim)
         init = nnx.initializers.xavier_uniform(in_axis=(0, 1, 2))
-        self.noisy_channels, self.patch, self.dtype = noisy_channels, patch, jnp.dtype(dtype)
+        self.noisy_channels, self.patch = config.out_channels, patch
+        self.dtype = jnp.dtype(config.dtype)
         self.kernel = nnx.Param(init(rngs.params(), shape), axes=(None, None, None, "embed"))
-        self.bias = nnx.Param(jnp.zeros(dim), axes=("embed",))
+        self.bias = nnx.Param(jnp.zeros(config.dim), axes=("embed",))
 
     def noisy(self, latents: Float[Array, "b f h w c"]) -> Float[Array, "b n d"]:
         """Return the contribution of the noisy channels."""
@@ -51,20 +46,18 @@ class PatchEmbedding(nnx.Module):
         kernel = rearrange(kernel, "c i j d -> (c i j) d")
         return patches.astype(self.dtype) @ kernel.astype(self.dtype)
 
-
-def check_condition(
-    shape: tuple[int, ...], *, in_channels: int, noisy_channels: int, patch: int
-) -> None:
-    """Raise `InputError` unless a condition `b f h w c` fits the channels and the patches."""
-    _, _, h, w, channels = shape
-    if channels != in_channels - noisy_channels:
-        raise InputError(
-            f"A condition of {channels} channels does not fit this model: it reads "
-            f"{in_channels - noisy_channels} in addition to the {noisy_channels} noisy ones "
-            f"(in_channels {in_channels})."
-        )
-    if h % patch or w % patch:
-        raise InputError(
-            f"Latents of {h} x {w} cells do not split into patches of {patch} x {patch}: both "
-            "sizes must be even (pixels in multiples of 16)."
-        )
+    def check(self, condition: tuple[int, ...]) -> None:
+        """Raise `InputError` unless a condition `b f h w c` fits the channels and the patches."""
+        _, _, h, w, channels = condition
+        in_channels, patch = self.kernel.shape[0], self.patch
+        if channels != in_channels - self.noisy_channels:
+            raise InputError(
+                f"A condition of {channels} channels does not fit this model: it reads "
+                f"{in_channels - self.noisy_channels} in addition to the {self.noisy_channels} "
+                f"noisy ones (in_channels {in_channels})."
+            )
+        if h % patch or w % patch:
+            raise InputError(
+                f"Latents of {h} x {w} cells do not split into patches of {patch} x {patch}: both "
+                "sizes must be even (pixels in multiples of 16)."
+            )

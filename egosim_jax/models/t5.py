@@ -64,7 +64,6 @@ class T5Sizes:
     """Dtype of the linears and of the residual stream; norms and softmax are float32."""
 
     def __post_init__(self) -> None:
-        """Check that each direction has exact and logarithmic buckets."""
         if self.buckets < 4 or self.buckets % 4:
             raise InputError(
                 f"{self.buckets} buckets cannot be split into two directions of exact and "

@@ -84,41 +84,22 @@ class OutOfMemory:
 def compile_for(
     target: Target, traced: Any, *, model_flops: float = math.nan, resident: int = 0
 ) -> Report | OutOfMemory:
-    """Compile a trace of `jax.jit` for the target's devices, and report its costs."""
-    begun = time.perf_counter()
-    try:
-        compiled = traced.lower().compile()
-    except jax.errors.JaxRuntimeError as error:
-        return parse_oom(error, target)
-    return inspect(
-        compiled,
-        target,
-        model_flops=model_flops,
-        hardware_flops=flops.count(traced.jaxpr),
-        compile_s=time.perf_counter() - begun,
-        resident=resident,
-    )
-
-
-def inspect(
-    compiled: Any,
-    target: Target,
-    *,
-    model_flops: float,
-    hardware_flops: float,
-    compile_s: float,
-    resident: int,
-) -> Report:
-    """Return the costs of a program that was compiled for a target.
+    """Compile a trace of `jax.jit` for the target's devices, and report its costs.
 
     `resident` is the size in bytes of other data on the device, such as all networks' weights.
     """
-    stats = compiled.memory_analysis()
+    begun = time.perf_counter()
+    try:
+        stats = traced.lower().compile().memory_analysis()
+    except jax.errors.JaxRuntimeError as error:
+        return parse_oom(error, target)
+    compile_s = time.perf_counter() - begun
     device, count = target.device, len(target.devices)
     results = stats.output_size_in_bytes - stats.alias_size_in_bytes
     temporaries = stats.temp_size_in_bytes
     if device.platform == "tpu":  # its temporaries include donated arguments
         temporaries = stats.peak_memory_in_bytes - stats.argument_size_in_bytes - results
+    hardware_flops = flops.count(traced.jaxpr)
     return Report(
         target=target.name,
         devices=count,

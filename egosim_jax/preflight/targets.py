@@ -94,25 +94,13 @@ DEVICES: Mapping[str, Device] = {
     ),
     # Google's pages on each TPU version; memory as the compiler reports it.
     "v5e": Device(
-        kind="TPU v5 lite",
-        platform="tpu",
-        flops=197e12,
-        memory=15.75 * GIB,
-        bandwidth=0.8e12,
+        kind="TPU v5 lite", platform="tpu", flops=197e12, memory=15.75 * GIB, bandwidth=0.8e12
     ),
     "v5p": Device(
-        kind="TPU v5",
-        platform="tpu",
-        flops=459e12,
-        memory=95.74 * GIB,
-        bandwidth=2.765e12,
+        kind="TPU v5", platform="tpu", flops=459e12, memory=95.74 * GIB, bandwidth=2.765e12
     ),
     "v6e": Device(
-        kind="TPU v6 lite",
-        platform="tpu",
-        flops=918e12,
-        memory=31.25 * GIB,
-        bandwidth=1.6e12,
+        kind="TPU v6 lite", platform="tpu", flops=918e12, memory=31.25 * GIB, bandwidth=1.6e12
     ),
 }
 """Devices by the name in a target."""

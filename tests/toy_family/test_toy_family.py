@@ -28,7 +28,6 @@ from egosim_jax.models import (
     VideoCodec,
     VideoCodecConfig,
 )
-from egosim_jax.models.lora import metadata
 from egosim_jax.train.config import TrainConfig
 from egosim_jax.train.encode import check_encoders
 from egosim_jax.train.fine_tuning import FineTuning
@@ -157,13 +156,6 @@ def test_a_mask_or_patch_without_cells_is_refused(toy: ModelConfig, changes, mes
     changed = {name: replace(getattr(toy, name), **fields) for name, fields in changes.items()}
     with pytest.raises(InputError, match=message):
         replace(toy, **changed)
-
-
-def test_a_lora_of_other_weights_is_refused(weights: Path, tmp_path: Path):
-    file = tmp_path / "lora.safetensors"
-    save_file({}, file, metadata=metadata("toy", base="0" * 64))
-    with pytest.raises(InputError, match="trained on other weights"):
-        Generator.load("toy", weights, lora=file)
 
 
 def test_loading_changes_no_setting_of_jax(weights: Path):

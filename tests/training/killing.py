@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from egosim_jax.train.distributed import free_local_address
-from tests.flags import QUICK
+from tests import flags
 
 ROOT = Path(__file__).parents[2]
 
@@ -24,6 +24,36 @@ def logged(out: Path) -> list[dict[str, float]]:
         {name: value for name, value in json.loads(line).items() if name not in timings}
         for line in text.splitlines(keepends=True)
         if line.endswith("\n")
+    ]
+
+
+def start_line(
+    out: Path,
+    data: Path,
+    *,
+    devices: int = 1,
+    env: dict[str, str] | None = None,
+    new_group: bool = False,
+    **changes,
+) -> subprocess.Popen:
+    """Start `tests.training.line` with `TrainConfig` fields; its stderr is a pipe."""
+    command = [sys.executable, "-m", "tests.training.line", str(out), str(data)]
+    return subprocess.Popen(
+        [*command, json.dumps(changes)],
+        cwd=ROOT,
+        env=os.environ | flags.devices(devices) | (env or {}),
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=new_group,
+    )
+
+
+def start_pair(out: Path, *given: tuple[Path, dict]) -> list[subprocess.Popen]:
+    """Start the two processes of a run, each with its data and settings (`start_line`)."""
+    shared = {"JAX_COORDINATOR_ADDRESS": free_local_address(), "JAX_NUM_PROCESSES": "2"}
+    return [
+        start_line(out, data, env={**shared, "JAX_PROCESS_ID": str(index)}, **settings)
+        for index, (data, settings) in enumerate(given)
     ]
 
 
@@ -50,7 +80,7 @@ class Run:
         address = free_local_address()
         started, self._left = [], self._incomplete()
         for index in range(self.processes):
-            environment = os.environ | {"XLA_FLAGS": QUICK}
+            environment = os.environ | {"XLA_FLAGS": flags.QUICK}
             if self.processes > 1:
                 environment |= {
                     "JAX_COORDINATOR_ADDRESS": address,

@@ -5,7 +5,6 @@
 kills ten times and prints how long the other took to end.
 """
 
-import json
 import os
 import random
 import signal
@@ -19,10 +18,8 @@ import pytest
 
 from egosim_jax.io.atomic import lock_folder
 from egosim_jax.runtime.command import ExitCode
-from egosim_jax.train.distributed import free_local_address
 from egosim_jax.train.peers import PEER_DIED
-from tests import flags
-from tests.training.killing import ROOT, Run, logged
+from tests.training.killing import Run, logged, start_pair
 from tests.training.line import write_points
 
 pytestmark = pytest.mark.slow
@@ -92,33 +89,18 @@ def test_a_run_survives_random_deaths(tmp_path):
     assert logged(killed.out) == logged(whole.out)
 
 
-def run_two(
-    out: Path, data: list[Path], settings: list[dict[str, object]]
-) -> tuple[list[int], list[str]]:
-    """Run two processes with their own data and settings; return their exit codes and stderr."""
-    address, processes = free_local_address(), []
-    for index in range(2):
-        command = [sys.executable, "-m", "tests.training.line", str(out), str(data[index])]
-        shared = {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": "2"}
-        processes.append(
-            subprocess.Popen(
-                [*command, json.dumps(settings[index])],
-                cwd=ROOT,
-                env=os.environ | flags.devices(1) | shared | {"JAX_PROCESS_ID": str(index)},
-                stderr=subprocess.PIPE,
-                text=True,
-            )
-        )
+def run_two(out: Path, *given: tuple[Path, dict]) -> tuple[list[int], list[str]]:
+    """Run two processes, each with its data and settings; return their exit codes and stderr."""
+    processes = start_pair(out, *given)
     said = [process.communicate(timeout=300)[1] for process in processes]
     return [process.returncode for process in processes], said
 
 
 @pytest.mark.parametrize("failing", [0, 1])
 def test_the_error_of_one_process_ends_the_other(tmp_path, failing):
-    data = write_points(tmp_path / "data")
-    read = [data, data]
-    read[failing] = tmp_path / "missing"
-    codes, said = run_two(tmp_path / "run", read, [{}, {}])
+    given = [(write_points(tmp_path / "data"), {})] * 2
+    given[failing] = tmp_path / "missing", {}
+    codes, said = run_two(tmp_path / "run", *given)
     assert codes[failing] == ExitCode.USAGE
     assert "missing" in said[failing]
     assert codes[1 - failing] == ExitCode.RESUBMIT
@@ -127,15 +109,15 @@ def test_the_error_of_one_process_ends_the_other(tmp_path, failing):
 
 
 def test_an_error_of_all_processes_is_printed_by_each(tmp_path):
-    missing = tmp_path / "missing"
-    codes, said = run_two(tmp_path / "run", [missing, missing], [{}, {}])
+    missing = tmp_path / "missing", {}
+    codes, said = run_two(tmp_path / "run", missing, missing)
     assert codes == [ExitCode.USAGE, ExitCode.USAGE]
     assert all("missing" in text and PEER_DIED not in text for text in said)
 
 
 def test_processes_with_different_options_are_refused(tmp_path):
     data = write_points(tmp_path / "data")
-    codes, said = run_two(tmp_path / "run", [data, data], [{"seed": 1}, {"seed": 2}])
+    codes, said = run_two(tmp_path / "run", (data, {"seed": 1}), (data, {"seed": 2}))
     assert codes == [ExitCode.RESUBMIT, ExitCode.USAGE]
     assert "training.seed: the folder has 1, this run has 2" in said[1]
 
@@ -143,6 +125,6 @@ def test_processes_with_different_options_are_refused(tmp_path):
 def test_all_processes_refuse_a_folder_that_another_run_uses(tmp_path):
     data = write_points(tmp_path / "data")
     with lock_folder(tmp_path / "run"):
-        codes, said = run_two(tmp_path / "run", [data, data], [{}, {}])
+        codes, said = run_two(tmp_path / "run", (data, {}), (data, {}))
     assert codes == [ExitCode.USAGE, ExitCode.USAGE]
     assert all(f"in use by another process (PID {os.getpid()})" in text for text in said)

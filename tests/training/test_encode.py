@@ -222,12 +222,6 @@ def test_a_folder_of_other_encoders_or_clips_is_refused(encoded, source, weights
         encode(clips, weights, encoded)
 
 
-def test_a_folder_of_other_shards_is_refused(source, weights, tmp_path):
-    write_clips(tmp_path, CONFIG.video)
-    with pytest.raises(InputError, match="already holds other shards"):
-        encode(source, weights, tmp_path)
-
-
 def test_what_cannot_be_encoded_is_refused(encoded, source, weights, tmp_path):
     with pytest.raises(InputError, match="expected videos or frames with their target"):
         encode(ShardReader(encoded), weights, tmp_path / "a")
@@ -236,6 +230,8 @@ def test_what_cannot_be_encoded_is_refused(encoded, source, weights, tmp_path):
         encode(short, weights, tmp_path / "b")
     with pytest.raises(InputError, match="--batch-size must be at least 1"):
         encode(source, weights, tmp_path / "c", batch_size=0)
+    with pytest.raises(InputError, match="already holds other shards"):
+        encode(source, weights, tmp_path / "short")
 
 
 def damage(source: ShardReader, numbers: Collection[int], folder: Path) -> ShardReader:
@@ -299,52 +295,62 @@ def test_shards_fit_the_weights_that_encoded_them(encoded, weights, others):
     assert hashes(others)["vae"][:16] in str(caught.value)
 
 
-def test_shards_of_another_model_are_refused(encoded, weights):
+def test_shards_of_another_model_or_for_weights_without_a_vae_are_refused(
+    encoded, weights, tmp_path
+):
     with pytest.raises(InputError, match="config: the shards have debug, this training has odd"):
         check_encoders(encoded, dataclasses.replace(CONFIG, name="odd"), None)
     with pytest.raises(InputError, match=r"video: .*height=16.*height=64"):
         check_encoders(encoded, DEBUG, weights)
-
-
-def test_weights_without_a_vae_are_refused(encoded, tmp_path):
     with pytest.raises(InputError, match=r"vae: the shards have .* none"):
         check_encoders(encoded, CONFIG, tmp_path)
 
 
-def test_shards_without_hashes_of_encoders_are_refused(tmp_path):
-    with ShardWriter(tmp_path, kind="latents", spec=CONFIG.video) as writer:
+@pytest.mark.parametrize(
+    ("provenance", "message"),
+    [
+        ({}, "without the hashes of their encoders"),
+        (
+            {"config": "debug", "encoders": {"vae": "1" * 64}},
+            r"mask: the shards have no record of it.*Encode again",
+        ),
+    ],
+)
+def test_shards_without_a_record_of_encoders_or_mask_are_refused(tmp_path, provenance, message):
+    spec = CONFIG.video
+    with ShardWriter(tmp_path, kind="latents", spec=spec, provenance=provenance) as writer:
         writer.add({"target": np.zeros((2, 2, 4, 16), np.float32)}, {"video_id": "a"})
-    with pytest.raises(InputError, match="without the hashes of their encoders"):
+    with pytest.raises(InputError, match=message):
         check_encoders(tmp_path, CONFIG, None)
 
 
-def test_shards_that_do_not_name_the_packing_of_their_mask_are_refused(tmp_path):
-    known = {"config": "debug", "encoders": {"vae": "1" * 64}}
-    with ShardWriter(tmp_path, kind="latents", spec=CONFIG.video, provenance=known) as writer:
-        writer.add({"target": np.zeros((2, 2, 4, 16), np.float32)}, {"video_id": "a"})
-    with pytest.raises(InputError, match=r"mask: the shards have no record of it.*Encode again"):
-        check_encoders(tmp_path, CONFIG, None)
+def start(weights: Path, clips: Path, out: Path, count: int) -> list[subprocess.Popen]:
+    """Start the processes of an encoding by the command."""
+    shared = {"JAX_COORDINATOR_ADDRESS": free_local_address(), "JAX_NUM_PROCESSES": str(count)}
+    return [
+        subprocess.Popen(
+            [sys.executable, "-m", "egosim_jax.cli", *command(weights, clips, out)],
+            env=os.environ
+            | flags.devices(1)
+            | ({**shared, "JAX_PROCESS_ID": str(index)} if count > 1 else {}),
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for index in range(count)
+    ]
+
+
+def command(weights: Path, clips: Path, out: Path) -> list[str]:
+    options = {"config": "debug", "weights": weights, "shards": clips, "out": out}
+    given = [text for name, value in options.items() for text in (f"--{name}", str(value))]
+    return ["data", "encode", *given, "--shard-windows", "2"]
 
 
 def test_one_of_two_processes_is_killed_and_one_process_goes_on(weights, tmp_path):
     """Killed when its first part of several exists, while both still encode."""
     clips = write_clips(tmp_path / "clips", DEBUG.video, count=24, frames=13)
-    fixed = ["--config", "debug", "--weights", str(weights), "--shards", str(clips)]
-
-    def arguments(out: Path) -> list[str]:
-        return ["data", "encode", *fixed, "--out", str(out), "--shard-windows", "2"]
-
     out = tmp_path / "killed"
-    shared = {"JAX_COORDINATOR_ADDRESS": free_local_address(), "JAX_NUM_PROCESSES": "2"}
-    other, victim = (
-        subprocess.Popen(
-            [sys.executable, "-m", "egosim_jax.cli", *arguments(out)],
-            env=os.environ | flags.devices(1) | shared | {"JAX_PROCESS_ID": str(index)},
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for index in range(2)
-    )
+    other, victim = start(weights, clips, out, 2)
     while victim.poll() is None and not (out / "parts" / "00001" / MANIFEST).exists():
         time.sleep(0.01)
     victim.kill()
@@ -353,31 +359,17 @@ def test_one_of_two_processes_is_killed_and_one_process_goes_on(weights, tmp_pat
     assert other.returncode == ExitCode.RESUBMIT, said
     assert said.rstrip().endswith(PEER_DIED)
     assert not (out / MANIFEST).exists()
-    assert main(arguments(out)) == 0
-    assert main(arguments(tmp_path / "whole")) == 0
-    first, second = read_manifest(out), read_manifest(tmp_path / "whole")
-    assert first == second
+    assert main(command(weights, clips, out)) == 0
+    assert main(command(weights, clips, tmp_path / "whole")) == 0
+    assert read_manifest(out) == read_manifest(tmp_path / "whole")
     assert json.loads((out / "config.json").read_text("utf-8"))["config"] == "debug"
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_sigterm_ends_an_encoding_with_75_and_it_goes_on(weights, tmp_path, count):
     clips = write_clips(tmp_path / "clips", DEBUG.video, count=24, frames=13)
-    out, address = tmp_path / "out", free_local_address()
-    options = ["--config", "debug", "--weights", str(weights), "--shards", str(clips)]
-    options += ["--out", str(out), "--shard-windows", "2"]
-    joins = {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": "2"}
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-m", "egosim_jax.cli", "data", "encode", *options],
-            env=os.environ
-            | flags.devices(1)
-            | ({**joins, "JAX_PROCESS_ID": str(index)} if count == 2 else {}),
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for index in range(count)
-    ]
+    out = tmp_path / "out"
+    processes = start(weights, clips, out, count)
     while processes[-1].poll() is None and not list(out.glob(f"parts/*{count - 1}/{MANIFEST}")):
         time.sleep(0.01)
     for process in processes:
@@ -386,7 +378,7 @@ def test_sigterm_ends_an_encoding_with_75_and_it_goes_on(weights, tmp_path, coun
     assert {process.returncode for process in processes} == {ExitCode.RESUBMIT}, said
     assert not (out / MANIFEST).exists()
     assert list(out.glob(f"parts/*/{MANIFEST}"))
-    assert main(["data", "encode", *options]) == 0
+    assert main(command(weights, clips, out)) == 0
     assert len(ShardReader(out)) == 24
 
 

@@ -66,37 +66,35 @@ def read(tmp_path):
     return write
 
 
-def named(items):
-    return [item.video_id for item in items]
+@pytest.mark.parametrize(
+    ("splits", "held_out"),
+    [
+        (["test", "train", "train", "test"], [0, 3]),
+        (["train"] * 17, [7, 15]),
+        ([None] * 17, [7, 15]),
+        (["train"] * 3, [2]),
+    ],
+)
+def test_clips_are_held_out_by_their_split_or_every_eighth_or_the_last(
+    read, splits, held_out, capsys
+):
+    items = read(*splits)
+    train, test = (
+        [int(item.video_id.removeprefix("clip")) for item in select_split(items, split)]
+        for split in ("train", "test")
+    )
+    assert test == held_out
+    assert sorted(train + test) == list(range(len(splits)))
+    assert ("are held out" in capsys.readouterr().out) == ("test" not in splits)
 
 
-def test_splits_that_are_given_are_kept(read):
-    items = read("test", "train", "train", "test")
-    assert named(select_split(items, "train")) == ["clip1", "clip2"]
-    assert named(select_split(items, "test")) == ["clip0", "clip3"]
-
-
-@pytest.mark.parametrize("split", ["train", None])
-def test_every_eighth_clip_is_held_out(read, split, capsys):
-    items = read(*[split] * 17)
-    assert named(select_split(items, "test")) == ["clip7", "clip15"]
-    assert "2 of 17 are held out" in capsys.readouterr().out
-    assert named(select_split(items, "train")) == [
-        f"clip{n}" for n in range(17) if n not in (7, 15)
-    ]
-
-
-def test_of_few_clips_the_last_is_held_out(read):
-    items = read("train", "train", "train")
-    assert named(select_split(items, "test")) == ["clip2"]
-    assert named(select_split(items, "train")) == ["clip0", "clip1"]
-
-
-def test_one_clip_is_refused(read):
-    with pytest.raises(InputError, match=r"one clip: validation needs another"):
-        select_split(read("train"), "train")
-
-
-def test_other_splits_are_refused(read):
-    with pytest.raises(InputError, match="No clip has split=test; split is one of: train, val"):
-        select_split(read("train", "val"), "test")
+@pytest.mark.parametrize(
+    ("splits", "message"),
+    [
+        (["train"], "one clip: validation needs another"),
+        (["train", "val"], "No clip has split=test; split is one of: train, val"),
+    ],
+)
+def test_clips_without_a_split_to_validate_on_are_refused(read, splits, message):
+    with pytest.raises(InputError, match=message):
+        select_split(read(*splits), "test")

@@ -61,16 +61,6 @@ def test_classical_perception_reads_what_was_generated(clips, monkeypatch):
     assert np.linalg.norm(have - want) > 0.005
 
 
-def test_rollouts_without_a_model_are_refused():
-    with pytest.raises(InputError, match="--rollouts, --weights"):
-        type(TABLETOP)(config="tabletop", vae=TABLETOP.vae, denoiser=TABLETOP.denoiser, rollouts=4)
-
-
-def test_scenes_that_are_held_out_are_refused():
-    with pytest.raises(InputError, match=r"held out: --first-scene must be at least 1000, not 999"):
-        replace(TABLETOP, first_scene=999)
-
-
 def test_given_weights_are_trained_further_on_other_scenes(monkeypatch, tmp_path):
     made = {}
 
@@ -81,3 +71,12 @@ def test_given_weights_are_trained_further_on_other_scenes(monkeypatch, tmp_path
     monkeypatch.setattr(type(TABLETOP), "_make", make)
     replace(TABLETOP, first_scene=2000, scenes=30, rollouts=5, weights=Path()).frames(tmp_path)
     assert made == {"train": range(2000, 2030), "test": range(48), "rollouts": range(2030, 2035)}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"rollouts": 4}, "--rollouts, --weights"), ({"first_scene": 999}, "at least 1000, not 999")],
+)
+def test_rollouts_without_a_model_and_held_out_scenes_are_refused(options, message):
+    with pytest.raises(InputError, match=message):
+        replace(TABLETOP, **options)

@@ -1,6 +1,5 @@
 """Runs that are killed, stopped, hung, or resumed on other devices, as separate programs."""
 
-import json
 import os
 import signal
 import subprocess
@@ -14,9 +13,7 @@ import pytest
 from egosim_jax.data.loader import make_loader
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.runtime.command import ExitCode
-from egosim_jax.train.distributed import free_local_address
-from tests import flags
-from tests.training.killing import logged
+from tests.training.killing import logged, start_line, start_pair
 from tests.training.line import write_points
 
 pytestmark = pytest.mark.slow
@@ -31,28 +28,8 @@ def points(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_points(tmp_path_factory.mktemp("points"))
 
 
-def start(
-    out: Path,
-    data: Path,
-    *,
-    devices: int = 1,
-    env: dict[str, str] | None = None,
-    new_group: bool = False,
-    **changes,
-):
-    command = [sys.executable, "-m", "tests.training.line", str(out), str(data)]
-    return subprocess.Popen(
-        [*command, json.dumps(changes)],
-        cwd=ROOT,
-        env=os.environ | flags.devices(devices) | (env or {}),
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=new_group,
-    )
-
-
 def run(out: Path, data: Path, **settings) -> str:
-    process = start(out, data, **settings)
+    process = start_line(out, data, **settings)
     said = process.communicate(timeout=300)[1]
     assert process.returncode == ExitCode.DONE, said
     return said
@@ -86,7 +63,7 @@ def test_sigterm_is_heard_at_the_next_update_and_the_rest_is_the_same(
     """At first, after a save, at a validation, and as Slurm: to all processes."""
     out, settings = tmp_path / "run", LONG | {"workers": workers}
     for step in (1, 7, 10) if not workers else (9,):
-        process = start(out, points, new_group=True, **settings)
+        process = start_line(out, points, new_group=True, **settings)
         wait_for(out, step, process)
         os.killpg(process.pid, signal.SIGTERM)
         before = updates(out)
@@ -102,7 +79,7 @@ def test_sigterm_before_the_first_update_ends_with_75_and_leaves_nothing(
     points, straight, tmp_path
 ):
     out = tmp_path / "run"
-    process = start(out, points, **LONG)
+    process = start_line(out, points, **LONG)
     while not (out / "config.json").exists():  # then it reads a batch and compiles
         assert process.poll() is None
         time.sleep(0.001)
@@ -133,7 +110,7 @@ def test_sigterm_during_imports_ends_with_75(command):
 def test_a_run_that_hangs_prints_its_stacks_and_ends_with_70(points, tmp_path):
     batches = make_loader(ShardReader(points), batch_size=8, seed=0)
     late = [next(batches)["record"] for _ in range(5)][-1]
-    process = start(tmp_path / "run", points, hang=int(late[0]), hang_timeout_s=1.0)
+    process = start_line(tmp_path / "run", points, hang=int(late[0]), hang_timeout_s=1.0)
     said = process.communicate(timeout=300)[1]
     assert process.returncode == ExitCode.HUNG, said
     assert "no update finished" in said
@@ -147,7 +124,7 @@ def test_a_run_resumes_on_other_numbers_of_devices(points, tmp_path):
     schedule = {"steps": 40, "save_every": 10, "pause": 0.06}
     meshes = [(8, {"fsdp": 8}), (8, {"data": 4, "fsdp": 2})]
     for count, (devices, mesh) in enumerate(meshes, start=1):
-        process = start(out, points, devices=devices, mesh=mesh, **schedule)
+        process = start_line(out, points, devices=devices, mesh=mesh, **schedule)
         wait_for(out, 10 * count + 3, process)
         process.kill()
         process.communicate()
@@ -158,15 +135,6 @@ def test_a_run_resumes_on_other_numbers_of_devices(points, tmp_path):
     np.testing.assert_allclose(*losses, rtol=1e-5)
 
 
-def pair(out: Path, data: Path, **settings) -> list[subprocess.Popen]:
-    """Two processes of one run."""
-    shared = {"JAX_COORDINATOR_ADDRESS": free_local_address(), "JAX_NUM_PROCESSES": "2"}
-    return [
-        start(out, data, env={**shared, "JAX_PROCESS_ID": str(index)}, **settings)
-        for index in range(2)
-    ]
-
-
 def finish(processes: list[subprocess.Popen]) -> list[int]:
     said = [process.communicate(timeout=300)[1] for process in processes]
     codes = [process.returncode for process in processes]
@@ -175,22 +143,22 @@ def finish(processes: list[subprocess.Popen]) -> list[int]:
 
 
 def test_two_processes_stop_together_and_resume_bit_for_bit(points, tmp_path):
-    schedule = LONG | {"pause": 0.06}
+    both = [(points, LONG | {"pause": 0.06})] * 2
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-    assert finish(pair(whole, points, **schedule)) == [ExitCode.DONE, ExitCode.DONE]
+    assert finish(start_pair(whole, *both)) == [ExitCode.DONE, ExitCode.DONE]
     for step, receiver in ((9, 1), (16, 0)):  # after a save, and after a resume and a save
-        processes = pair(stopped, points, **schedule)
+        processes = start_pair(stopped, *both)
         wait_for(stopped, step, *processes)
         processes[receiver].send_signal(signal.SIGTERM)
         before = updates(stopped)
         assert finish(processes) == [ExitCode.RESUBMIT, ExitCode.RESUBMIT]
         assert before <= updates(stopped) <= before + 2  # the signal is passed on first
-    processes = pair(stopped, points, **schedule)
+    processes = start_pair(stopped, *both)
     wait_for(stopped, updates(stopped) + 9, *processes)
     for process in processes:
         process.kill()
         process.communicate()
-    assert finish(pair(stopped, points, **schedule)) == [ExitCode.DONE, ExitCode.DONE]
+    assert finish(start_pair(stopped, *both)) == [ExitCode.DONE, ExitCode.DONE]
     assert logged(stopped) == logged(whole)
     steps = [line["step"] for line in logged(whole) if "loss" in line]
     assert steps == list(range(1, STEPS + 1))
@@ -211,7 +179,7 @@ def test_two_processes_stop_together_and_resume_bit_for_bit(points, tmp_path):
     ],
 )
 def test_an_incomplete_or_invalid_process_environment_is_refused(points, tmp_path, given, said):
-    process = start(tmp_path / "run", points, env=given)
+    process = start_line(tmp_path / "run", points, env=given)
     assert said in process.communicate(timeout=120)[1]
     assert process.returncode == 2
 

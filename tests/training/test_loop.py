@@ -134,6 +134,14 @@ def test_the_ema_follows_its_formula(points, tmp_path):
     np.testing.assert_allclose(have, want, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("decay", [0.9, 0.9999])
+def test_the_average_is_warmed_up(decay):
+    optimizer = OptimizerConfig(ema_decay=decay)
+    first, later, last = (float(optimizer.ema_decay_at(jnp.int32(n))) for n in (0, 2, 10**6))
+    assert (first, later) == pytest.approx((1 / 10, 3 / 12))
+    assert last == pytest.approx(decay)
+
+
 def test_a_run_resumes_with_other_intervals_but_not_with_another_seed(points, tmp_path):
     fit(tmp_path, points)
     fit(tmp_path, points, log_every=7, save_every=3, keep=5, hang_timeout_s=9.0)
@@ -153,6 +161,8 @@ def test_a_batch_that_devices_cannot_share_says_what_would_do(points, tmp_path):
         InputError, match=r"A batch of 8 .* 3 micro-batches.* multiple of their product, 3"
     ):
         fit(tmp_path, points, grad_accum_steps=3)
+    with pytest.raises(InputError, match="does not fit 1 devices"):
+        fit(tmp_path, points, mesh=MeshConfig(data=3))
 
 
 def test_a_run_without_a_checkpoint_starts_again_with_other_options(points, tmp_path):
@@ -161,11 +171,6 @@ def test_a_run_without_a_checkpoint_starts_again_with_other_options(points, tmp_
     fit(tmp_path, points, seed=1, steps=5)
     with pytest.raises(InputError, match=r"training\.seed"):
         fit(tmp_path, points, seed=2, steps=5)
-
-
-def test_a_mesh_that_is_not_of_the_devices_is_refused(points, tmp_path):
-    with pytest.raises(InputError, match="does not fit 1 devices"):
-        fit(tmp_path, points, mesh=MeshConfig(data=3))
 
 
 def test_tensorboard_gets_the_numbers(points, tmp_path):
@@ -204,10 +209,3 @@ def test_what_is_not_installed_is_named_with_its_extra(points, tmp_path, monkeyp
 def test_optimizer_settings_out_of_range_are_refused(field, value):
     with pytest.raises(InputError, match=field):
         OptimizerConfig(**{field: value})
-
-
-def test_the_config_of_the_run_is_in_its_folder(points, tmp_path):
-    fit(tmp_path, points)
-    config = json.loads((tmp_path / "config.json").read_text("utf-8"))
-    assert config["training"]["optimizer"]["learning_rate"] == 0.05
-    assert config["training"]["batch_size"] == dataclasses.asdict(training())["batch_size"]

@@ -12,8 +12,6 @@ from optax.contrib import MuonDimensionNumbers, muon
 
 from egosim_jax import configs
 from egosim_jax.configs.model import Networks
-from egosim_jax.diffusion.objective import Objective
-from egosim_jax.diffusion.process import RectifiedFlow
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.train.__main__ import main as egosim_train
 from egosim_jax.train.config import OptimizerConfig, make_optimizer
@@ -165,18 +163,6 @@ def test_grouped_muon_equals_muon_of_each_weight():
         np.testing.assert_allclose(other, one, atol=1e-4)
 
 
-def test_half_of_the_times_are_those_of_the_sampler():
-    process = RectifiedFlow(shift=3.0)
-    times = Objective(sampler_steps=2).sample_times(process, jax.random.key(0), 4000)
-    shares = [float(np.isclose(times, visited).mean()) for visited in (1.0, 0.75)]
-    np.testing.assert_allclose(shares, 0.25, atol=0.03)
-    uniform = Objective().sample_times(process, jax.random.key(1), 4000)
-    others = times[~np.isclose(times, 1.0) & ~np.isclose(times, 0.75)]
-    assert abs(float(others.mean() - uniform.mean())) < 0.03
-    with pytest.raises(InputError, match="sampler_steps"):
-        Objective(times="diffsynth", sampler_steps=2)
-
-
 def test_the_schedule_falls_to_a_hundredth():
     assert [schedule(share) for share in (0.0, 0.5, 1.0)] == pytest.approx([1, 0.5, 0.01])
 
@@ -189,14 +175,16 @@ def test_egosim_train_has_online_training_with_its_own_options(capsys):
     assert "--out" in capsys.readouterr().err
 
 
-def test_a_training_without_an_end_is_refused(tmp_path):
-    with pytest.raises(InputError, match="needs an end"):
-        OnlineTraining(minutes=None, out=tmp_path)
-
-
-def test_a_model_without_shipped_weights_needs_some(tmp_path):
-    with pytest.raises(InputError, match=r"debug has no weights.*--weights"):
-        OnlineTraining(config="debug", out=tmp_path)
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"minutes": None}, "needs an end"),
+        ({"config": "debug"}, r"no weights of debug.*--weights"),
+    ],
+)
+def test_a_training_without_an_end_or_weights_is_refused(options, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        OnlineTraining(**options, out=tmp_path)
 
 
 @pytest.mark.slow

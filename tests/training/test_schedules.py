@@ -1,6 +1,5 @@
 """The learning rate follows the step of the run, also after skipped updates."""
 
-import shutil
 from dataclasses import dataclass
 
 import jax
@@ -10,11 +9,9 @@ import pytest
 
 from egosim_jax.sharding import make_mesh
 from egosim_jax.train.config import OptimizerConfig, TrainConfig, learning_rate
-from egosim_jax.train.loop import train
 from egosim_jax.train.update import Programs, mean_metrics
 from egosim_jax.types import MeshConfig
-from tests.training.killing import logged
-from tests.training.line import Line, training, write_points
+from tests.training.line import Line
 
 STEPS, PEAK = 10, 0.1
 
@@ -56,24 +53,3 @@ def test_the_rate_in_the_log_is_the_rate_that_was_used(schedule, end):
             np.testing.assert_allclose(used, 0 if bad else rate, rtol=1e-4, atol=1e-7)
     assert float(jnp.asarray(learning_rate(optimizer, STEPS)(STEPS))) == pytest.approx(end)
     assert int(state.step) == STEPS
-
-
-def test_a_run_with_skips_logs_the_rate_of_each_step_and_resumes_bit_for_bit(tmp_path):
-    data = write_points(tmp_path / "points", huge=(3,))
-    config = training(steps=STEPS, save_every=3, keep=9, optimizer={"schedule": "cosine"})
-
-    def run():
-        networks = train(Line(), config, data=data, validation=None, out=tmp_path / "run")
-        return logged(tmp_path / "run"), np.asarray(networks.kernel[...])
-
-    log, kernel = run()
-    assert sum("skipped_updates" in line for line in log) == 2
-    rates = [
-        float(jnp.asarray(learning_rate(config.optimizer, STEPS)(step))) for step in range(STEPS)
-    ]
-    assert [line["lr"] for line in log] == pytest.approx(rates)
-    for step in (9, 10):
-        shutil.rmtree(tmp_path / "run/checkpoints" / str(step))
-    again, resumed = run()
-    assert again == log
-    np.testing.assert_array_equal(resumed, kernel)

@@ -223,11 +223,3 @@ def test_a_student_without_fitting_chunks_or_steps_is_refused(changes, message):
     recipe = dataclasses.replace(recipes.get("tabletop_student_dmd"), **changes)
     with pytest.raises(InputError, match=message):
         recipe.stages()
-
-
-def test_a_lora_alone_needs_its_rank(tmp_path):
-    recipe = dataclasses.replace(
-        recipes.get("egosim_14b_student_cd"), lora=tmp_path / "lora.safetensors"
-    )
-    with pytest.raises(InputError, match="rank"):
-        recipe.check_lora(tmp_path)

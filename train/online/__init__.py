@@ -3,7 +3,10 @@
 processes ─clips▶ encoder ─latents▶ pool ─batches▶ denoiser
                               └─latents and frames▶ decoder
 
-scenes    clips without end, by seed, and the process that makes them
+command   `egosim train tabletop --online`
+plan      settings, and the position that checkpoints keep
+scenes    clips without end, by seed, the processes that make them, and their queue
+latents   latents of clips made beforehand
 pool      what the updates draw from, on the accelerator
 denoiser  its updates, several in one program
 decoder   updates of the decoder of the VAE; its encoder stays, so that latents stay valid

@@ -24,10 +24,11 @@ from egosim_jax.configs.model import ModelConfig
 from egosim_jax.data.records import stacked
 from egosim_jax.io.atomic import atomic_write
 from egosim_jax.io.untrusted.npz import array_names, read_arrays
+from egosim_jax.io.weights import load
+from egosim_jax.models import abstract
 from egosim_jax.runtime.command import ExitCode, run_with_exit_codes
 from egosim_jax.train.online.pool import CHUNK, latent_shapes, make_encode
 from egosim_jax.train.online.scenes import EndlessScenes, row_of
-from egosim_jax.types import InputError
 
 SCALE = "_scale"
 """Suffix of the name of an array's scale."""
@@ -78,42 +79,6 @@ def read_latents(
             yield {name: array[start : start + CHUNK] for name, array in rows.items()}
 
 
-def make_latents(
-    model: ModelConfig,
-    weights: Path,
-    out: Path,
-    *,
-    first: int,
-    stride: int,
-    scenes: int,
-    clips: int = 2,
-    fused: float = 0.0,
-) -> Iterator[int]:
-    """Write the shards of `scenes` scenes; yield the number of clips after each shard."""
-    from egosim_jax.io.weights import load
-    from egosim_jax.models import abstract
-
-    vae = abstract(model.vae)
-    load(weights / "vae.safetensors", vae)
-    encode = partial(make_encode(model, vae), nnx.state(vae))
-    source = EndlessScenes(model=model, clips=clips, fused=fused)
-    out.mkdir(parents=True, exist_ok=True)
-    raw: list[Mapping[str, np.ndarray]] = []
-    encoded: list[Mapping[str, np.ndarray]] = []
-    made = 0
-    for seed in range(first, first + stride * scenes, stride):
-        raw += [row_of(triplet, model) for triplet in source.triplets(seed)]
-        while len(raw) >= CHUNK:
-            batch, raw = raw[:CHUNK], raw[CHUNK:]
-            rows = encode(stacked(batch))
-            encoded.append({name: np.asarray(array) for name, array in rows.items()})
-        if len(encoded) * CHUNK >= SHARD:
-            rows = {n: np.concatenate([part[n] for part in encoded]) for n in encoded[0]}
-            made, encoded = made + len(rows["ids"]), []
-            write_shard(out / f"{first}_{made:06d}.npz", rows)
-            yield made
-
-
 def main(
     *,
     out: Path,
@@ -137,14 +102,27 @@ def main(
         clips: Clips of a scene.
         fused: Fraction of scenes with fused states (Open3D).
     """
-    weights = weights or configs.shipped_weights(config)
-    if weights is None:
-        raise InputError(f"{config} has no weights in the package: give some. (--weights)")
-    model, began = configs.get(config), time.monotonic()
-    options = {"first": first, "stride": stride, "scenes": scenes, "clips": clips}
-    for made in make_latents(model, weights, out, fused=fused, **options):
-        pace = (time.monotonic() - began) / made
-        print(f"{made} clips, {pace:.2f} s each", file=sys.stderr, flush=True)
+    weights = weights or configs.weights_of(config, None)
+    model, began, made = configs.get(config), time.monotonic(), 0
+    vae = abstract(model.vae)
+    load(weights / "vae.safetensors", vae)
+    encode = partial(make_encode(model, vae), nnx.state(vae))
+    source = EndlessScenes(model=model, clips=clips, fused=fused)
+    out.mkdir(parents=True, exist_ok=True)
+    raw: list[Mapping[str, np.ndarray]] = []
+    encoded: list[Mapping[str, np.ndarray]] = []
+    for seed in range(first, first + stride * scenes, stride):
+        raw += [row_of(triplet, model) for triplet in source.triplets(seed)]
+        while len(raw) >= CHUNK:
+            batch, raw = raw[:CHUNK], raw[CHUNK:]
+            rows = encode(stacked(batch))
+            encoded.append({name: np.asarray(array) for name, array in rows.items()})
+        if len(encoded) * CHUNK >= SHARD:
+            rows = {name: np.concatenate([each[name] for each in encoded]) for name in encoded[0]}
+            made, encoded = made + len(rows["ids"]), []
+            write_shard(out / f"{first}_{made:06d}.npz", rows)
+            pace = (time.monotonic() - began) / made
+            print(f"{made} clips, {pace:.2f} s each", file=sys.stderr, flush=True)
     return ExitCode.DONE
 
 

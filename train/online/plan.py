@@ -1,8 +1,9 @@
-"""Settings of an online training."""
+"""Settings of an online training, and its position, which checkpoints keep."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -75,7 +76,6 @@ class OnlineTraining:
     """Seconds between writings of the weights."""
 
     def __post_init__(self) -> None:
-        """Raise `InputError` without an end, and for counts below 1."""
         if self.minutes is None and self.updates is None:
             raise InputError("A training needs an end: give minutes or updates. (--minutes)")
         _ = self.start
@@ -96,10 +96,7 @@ class OnlineTraining:
     @property
     def start(self) -> Path:
         """Folder of the weights to start from. Raises `InputError` without any."""
-        start = self.weights or configs.shipped_weights(self.config)
-        if start is None:
-            raise InputError(f"{self.config} has no weights in the package: give some. (--weights)")
-        return start
+        return configs.weights_of(self.config, self.weights)
 
     @property
     def denoising(self) -> FewSteps:
@@ -117,3 +114,34 @@ class OnlineTraining:
             part="decoder",
             motion_weight=4.0,
         )
+
+
+@dataclass(kw_only=True)
+class Progress:
+    """Counters of an online training, kept over interruptions."""
+
+    seconds: float = 0.0
+    """Seconds that the run had taken when this was last saved."""
+    first: float | None = None
+    """Second of the first update."""
+    done: int = 0
+    """Finished updates of the denoiser."""
+    skipped: int = 0
+    """Updates of the denoiser that were skipped because loss or gradient were not finite."""
+    decoded: int = 0
+    """Finished updates of the decoder."""
+    decoder_first: float | None = None
+    """Share of the run at the decoder's first update."""
+    pace: int | None = None
+    """Updates of the decoder next to one program of the denoiser's."""
+    arrived: int = 0
+    """Clips that the processes have made, so that they continue with other scenes."""
+
+    def get_state(self) -> Mapping[str, Any]:
+        """Return the counters as JSON."""
+        return asdict(self)
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Set the counters to saved ones."""
+        for name, value in state.items():
+            setattr(self, name, value)

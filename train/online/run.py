@@ -29,9 +29,8 @@ from egosim_jax.io import weights
 from egosim_jax.io.atomic import atomic_folder
 from egosim_jax.io.checkpoint import Checkpoints
 from egosim_jax.train.metric_writers import JsonLines
-from egosim_jax.train.online.arrivals import Clips, start_workers
 from egosim_jax.train.online.latents import read_latents
-from egosim_jax.train.online.plan import OnlineTraining
+from egosim_jax.train.online.plan import OnlineTraining, Progress
 from egosim_jax.train.online.pool import (
     CHUNK,
     Pool,
@@ -40,13 +39,14 @@ from egosim_jax.train.online.pool import (
     raw_shapes,
     videos_of,
 )
-from egosim_jax.train.online.progress import Progress
+from egosim_jax.train.online.scenes import Clips, start_workers
 from egosim_jax.train.online.updates import (
-    Updater,
+    create,
     make_decoder_update,
     make_denoiser_updates,
     make_generate,
     make_judge,
+    muon,
 )
 from egosim_jax.types import InputError
 
@@ -71,12 +71,14 @@ class OnlineRun:
         )
         self.vae = nnx.state(vae)
         self.graph, params = nnx.split(self.networks)
-        self.denoiser = Updater(weight_decay=plan.weight_decay, ema_decay=plan.ema_decay)
-        self.state = self.denoiser.create(params)
+        self.denoiser = muon(
+            weight_decay=plan.weight_decay, ema_decay=plan.ema_decay, batch=plan.batch
+        )
+        self.state = create(params, self.denoiser)
         trained = plan.refining.trained
         self.vae_graph, decoder, self.frozen = nnx.split(Networks(vae=vae), trained, ...)
-        self.decoder = Updater(ema_decay=plan.decoder_ema)
-        self.decoder_state = self.decoder.create(decoder)
+        self.decoder = muon(ema_decay=plan.decoder_ema, batch=plan.decoder_batch)
+        self.decoder_state = create(decoder, self.decoder)
         self.pool = Pool(latent_shapes(model, plan.clips))
         self.frames = Pool(self._frame_shapes())
         self.read: set[Path] = set()
@@ -87,6 +89,7 @@ class OnlineRun:
             states = self.checkpoints.restore(states, self.progress, fallback=True)
             self.state, self.decoder_state = states["denoiser"], states["decoder"]
             self.began -= self.progress.seconds
+        self.skipped: Any = self.progress.skipped
         self.log = JsonLines(plan.out / "metrics.jsonl", resume_after=self.progress.done)
 
     def _frame_shapes(self) -> dict[str, jax.ShapeDtypeStruct]:
@@ -130,16 +133,9 @@ class OnlineRun:
         for name in (*videos_of(plan.model), "pixels"):
             latents[name] = jax.ShapeDtypeStruct(latents[name].shape, np.float32)
         updates = make_denoiser_updates(
-            plan.denoising,
-            self.denoiser,
-            self.graph,
-            batch=plan.batch,
-            count=plan.per_program,
-            seed=plan.seed,
+            plan.denoising, self.denoiser, self.graph, count=plan.per_program, seed=plan.seed
         )
-        update = make_decoder_update(
-            plan.refining, self.decoder, self.vae_graph, batch=plan.decoder_batch, seed=plan.seed
-        )
+        update = make_decoder_update(plan.refining, self.decoder, self.vae_graph, seed=plan.seed)
         encode = make_encode(plan.model, nnx.merge(self.vae_graph, decoder.params, self.frozen).vae)
         generate = make_generate(plan.model, self.graph, batch=self.chunk)
         judge = make_judge(plan.denoising, self.graph, self.vae_graph, CHUNK)
@@ -149,10 +145,10 @@ class OnlineRun:
             "encode": (encode, self.vae, raw),
             "decoder": (update, decoder, self.frozen, frames, rows, one, one),
             "generate": (
-                generate, state.average, pool, frames["row"], frames["generated"], rows, rows,
+                generate, state.eval_params, pool, frames["row"], frames["generated"], rows, rows,
             ),
             "judge": (
-                judge, state.average, decoder.average, self.frozen, latents, raw["target"],
+                judge, state.eval_params, decoder.eval_params, self.frozen, latents, raw["target"],
             ),
         }  # fmt: skip
         if not plan.decoder_share:
@@ -251,7 +247,7 @@ class OnlineRun:
         self._say(
             step=self.progress.done,
             decoder_step=self.progress.decoded,
-            skipped=int(self.state.skipped),
+            skipped=int(self.skipped),
         )
 
     def _update(self, share: float) -> Mapping[str, jax.Array]:
@@ -260,9 +256,10 @@ class OnlineRun:
         steps = self.progress.done + 1 + np.arange(plan.per_program)
         rates = plan.learning_rate * schedule(share) * np.minimum(1, steps / WARMUP)
         rows = np.int32(len(self.pool))
-        self.state, metrics = self.updates(
+        self.state, skipped, metrics = self.updates(
             self.state, self.pool.arrays, rows, rates.astype(np.float32)
         )
+        self.skipped = self.skipped + skipped  # on the device, which nothing waits for
         self.progress.done += plan.per_program
         return metrics
 
@@ -308,7 +305,7 @@ class OnlineRun:
         frames, seed = self.frames.arrays, np.int32(self.seconds)
         for start in range(0, len(self.frames), self.chunk):
             frames["generated"] = generate(
-                self.state.average,
+                self.state.eval_params,
                 self.pool.arrays,
                 frames["row"],
                 frames["generated"],
@@ -330,8 +327,8 @@ class OnlineRun:
         for start in range(0, count, CHUNK):
             raw = stacked(held[start : start + CHUNK])
             found = judge(
-                self.state.average,
-                self.decoder_state.average,
+                self.state.eval_params,
+                self.decoder_state.eval_params,
                 self.frozen,
                 self.encode(self.vae, raw),
                 raw["target"],
@@ -346,11 +343,11 @@ class OnlineRun:
         The checkpoint is written in the background.
         """
         if self.progress.done not in self.checkpoints.steps:
-            self.progress.seconds = self.seconds
+            self.progress.seconds, self.progress.skipped = self.seconds, int(self.skipped)
             states = {"denoiser": self.state, "decoder": self.decoder_state}
             self.checkpoints.save(self.progress.done, states, self.progress)
-        trained = nnx.merge(self.graph, self.state.average)
-        vae: Any = nnx.merge(self.vae_graph, self.decoder_state.average, self.frozen).vae
+        trained = nnx.merge(self.graph, self.state.eval_params)
+        vae: Any = nnx.merge(self.vae_graph, self.decoder_state.eval_params, self.frozen).vae
         networks = Networks(dit=trained.dit, text=trained.text, image=trained.image, vae=vae)
         with atomic_folder(self.plan.out / "weights") as folder:
             networks.save(folder, dtype="float16")

@@ -1,4 +1,4 @@
-"""Clips of the tabletop world without end, and the process that makes them.
+"""Clips of the tabletop world without end, the processes that make them, and their queue.
 
     python -m egosim_jax.train.online.scenes --queue FOLDER --first SEED --stride N
 
@@ -10,12 +10,15 @@ whether the scene is a script, an attempt, an encounter (modules of `worlds/tabl
 from __future__ import annotations
 
 import os
+import queue
+import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tyro
@@ -23,9 +26,12 @@ from jaxtyping import Float
 
 from egosim_jax import configs
 from egosim_jax.configs.model import ModelConfig
+from egosim_jax.data.records import stacked
 from egosim_jax.generation.encoding import pack
+from egosim_jax.io.untrusted.npz import read_all
 from egosim_jax.perception.oracle import OracleConfig
 from egosim_jax.state.fuse import fuse
+from egosim_jax.train.online.pool import CHUNK
 from egosim_jax.types import Action, Clip, Kind, SceneState, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import (
     TabletopClip,
@@ -38,6 +44,9 @@ from egosim_jax.worlds.tabletop.attempts import make_attempts
 from egosim_jax.worlds.tabletop.clips import observation_of, to_action, to_triplet
 from egosim_jax.worlds.tabletop.dataset import conditions_of
 from egosim_jax.worlds.tabletop.encounters import make_encounters
+
+if TYPE_CHECKING:
+    from egosim_jax.train.online.plan import OnlineTraining
 
 HELD_OUT = "held"
 """Prefix of the names of held-out clips in a queue."""
@@ -213,8 +222,57 @@ def queued(folder: Path) -> list[Path]:
     return [Path(path) for _, path in sorted(found)]
 
 
-def make(scenes: EndlessScenes, queue: Path, *, first: int, stride: int, held_out: int = 0) -> None:
-    """Make scenes until the process is ended or the queue's folder is removed.
+class Clips(threading.Thread):
+    """Reader of the queue: chunks of raw clips, and the held-out ones."""
+
+    def __init__(self, folder: Path):
+        super().__init__(daemon=True)
+        self.folder, self.chunks = folder, queue.Queue(maxsize=4)
+        self.held: list[Mapping[str, np.ndarray]] = []
+
+    def run(self) -> None:
+        """Read files as they appear."""
+        rows: list[Mapping[str, np.ndarray]] = []
+        while self.folder.is_dir():
+            for path in queued(self.folder):
+                row = read_all(path)  # NumPy's own reader fails in threads of Python 3.11
+                path.unlink()
+                if path.name.startswith(HELD_OUT):
+                    self.held.append(row)
+                    continue
+                rows.append(row)
+                if len(rows) == CHUNK:
+                    self.chunks.put(stacked(rows))
+                    rows = []
+            time.sleep(0.1)
+
+
+def start_workers(plan: OnlineTraining, folder: Path, *, made: int) -> list[subprocess.Popen]:
+    """Start the processes that make scenes, first the held-out ones.
+
+    `made` clips were made before an interruption; a scene has at least one of them.
+    """
+    threads = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", **dict.fromkeys(threads, "1")}
+    command = [sys.executable, "-m", "egosim_jax.train.online.scenes"]
+    command += ["--config", plan.model.name, "--queue", str(folder)]
+    command += ["--stride", str(plan.workers), "--held-out", str(plan.held_out), "--first"]
+    with (plan.out / "scenes.log").open("a") as log:
+        return [
+            subprocess.Popen(  # noqa: S603 - this package's module
+                [*command, str(plan.first_scene + made + number)],
+                env=environment,
+                stderr=log,
+                stdout=log,
+            )
+            for number in range(plan.workers)
+        ]
+
+
+def make(
+    scenes: EndlessScenes, folder: Path, *, first: int, stride: int, held_out: int = 0
+) -> None:
+    """Make scenes until the process is ended or the folder is removed.
 
     Its part of the held-out scenes, of seeds below `held_out`, comes first: one scripted clip each.
     """
@@ -222,14 +280,14 @@ def make(scenes: EndlessScenes, queue: Path, *, first: int, stride: int, held_ou
         kind = "human" if seed % 4 else "robot"
         clip = next(make_sequence(seed, spec=scenes.model.video, kind=kind, black_cloths=2))
         triplet = to_triplet(clip, point_px=scenes.model.point_px)
-        write_row(queue, f"{HELD_OUT}_{seed}", row_of(triplet, scenes.model))
+        write_row(folder, f"{HELD_OUT}_{seed}", row_of(triplet, scenes.model))
     seed = first
-    while queue.is_dir():
-        while queue.is_dir() and len(os.listdir(queue)) >= MAX_QUEUED:
+    while folder.is_dir():
+        while folder.is_dir() and len(os.listdir(folder)) >= MAX_QUEUED:
             time.sleep(0.2)
         try:
             for number, triplet in enumerate(scenes.triplets(seed)):
-                write_row(queue, f"{seed}_{number}", row_of(triplet, scenes.model))
+                write_row(folder, f"{seed}_{number}", row_of(triplet, scenes.model))
         except FileNotFoundError:
             return
         except Exception as problem:  # one bad scene must not end a run on a lent machine

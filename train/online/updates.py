@@ -5,147 +5,84 @@ The learning rate is an argument, because the schedule of a run of given minutes
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, no_type_check
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import nnx
 from jaxtyping import Array, Float, Key
 
 from egosim_jax.conditioning.pixels import to_model
 from egosim_jax.configs.model import ModelConfig, Networks
 from egosim_jax.generation.generator import denoise
-from egosim_jax.train.config import OptimizerConfig, make_optimizer
+from egosim_jax.train.config import OptimizerConfig, TrainConfig
 from egosim_jax.train.online.pool import Rows, as_floats
 from egosim_jax.train.task import Metrics
 from egosim_jax.train.tasks.autoencoding import psnr
 from egosim_jax.train.tasks.denoising import Denoising, condition_of
 from egosim_jax.train.tasks.refining import Refining, lpips
+from egosim_jax.train.update import TrainState, advance
 
 
-@no_type_check
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
-class OnlineState:
-    """All arrays that an update changes."""
-
-    step: jax.Array
-    """Number of finished updates, int32."""
-    params: nnx.State
-    """Trained weights in float32."""
-    opt_state: Any
-    """State of the optax transformation."""
-    average: nnx.State
-    """Moving average of the weights, which is validated and written."""
-    skipped: jax.Array
-    """Number of updates that were skipped because loss or gradient were not finite, int32."""
+def muon(*, weight_decay: float = 0.0, ema_decay: float, batch: int) -> TrainConfig:
+    """Return the training of a network by Muon; the learning rate is an argument of its update."""
+    optimizer = OptimizerConfig(name="muon", weight_decay=weight_decay, ema_decay=ema_decay)
+    return TrainConfig(steps=1, batch_size=batch, optimizer=optimizer)
 
 
-Loss = Callable[[nnx.State, Any, jax.Array], tuple[jax.Array, Metrics]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Updater:
-    """Optimizer of one network's training."""
-
-    weight_decay: float = 0.0
-    """Decoupled weight decay of matrices and kernels."""
-    ema_decay: float
-    """Decay of the moving average of the weights."""
-
-    @property
-    def optimizer(self) -> optax.GradientTransformation:
-        """Muon at rate 1."""
-        return make_optimizer(self.config)
-
-    @property
-    def config(self) -> OptimizerConfig:
-        """Hyper-parameters; the learning rate is an argument of the update."""
-        return OptimizerConfig(
-            name="muon", weight_decay=self.weight_decay, ema_decay=self.ema_decay
-        )
-
-    def create(self, params: nnx.State) -> OnlineState:
-        """Return the state before the first update."""
-        params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), params)
-        average: Any = jax.tree.map(jnp.copy, params)
-        return OnlineState(
-            step=jnp.int32(0),
-            params=params,
-            opt_state=self.optimizer.init(params),
-            average=average,
-            skipped=jnp.int32(0),
-        )
-
-    def update(
-        self, loss: Loss, state: OnlineState, batch: Any, keys: jax.Array, rate: jax.Array
-    ) -> tuple[OnlineState, Metrics]:
-        """Return the state after an update, and the metrics; a loss of NaN changes no weight."""
-        gradient = jax.value_and_grad(loss, has_aux=True)
-        (value, metrics), gradients = gradient(state.params, batch, keys)
-        valid = jnp.isfinite(value) & jnp.isfinite(optax.tree.norm(gradients))
-        updates, opt_state = self.optimizer.update(gradients, state.opt_state, state.params)
-        params: Any = optax.apply_updates(state.params, jax.tree.map(lambda x: rate * x, updates))
-        decay = self.config.ema_decay_at(state.step)
-        average: Any = optax.incremental_update(params, state.average, 1 - decay)
-        changed = OnlineState(
-            step=state.step + 1,
-            params=params,
-            opt_state=opt_state,
-            average=average,
-            skipped=state.skipped,
-        )
-        kept = replace(state, step=state.step + 1, skipped=state.skipped + 1)
-        state = jax.tree.map(lambda new, old: jnp.where(valid, new, old), changed, kept)
-        return state, {**metrics, "loss": value}
+def create(params: nnx.State, training: TrainConfig) -> TrainState:
+    """Return the state of a network's training before the first update, in float32."""
+    params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), params)
+    return TrainState.create(params, training.optimizer)
 
 
 def make_denoiser_updates(
-    task: Denoising, updater: Updater, graph: nnx.GraphDef, *, batch: int, count: int, seed: int
+    task: Denoising, training: TrainConfig, graph: nnx.GraphDef, *, count: int, seed: int
 ) -> Any:
     """Return the jitted function of `count` updates on random rows of a pool.
 
-    It takes state, the pool's arrays, its number of rows and `count` learning rates.
+    It takes state, the pool's arrays, its number of rows and `count` learning rates. It returns the
+    state, the number of skipped updates and the mean metrics.
     """
+    batch = training.batch_size
 
     def loss(params: nnx.State, rows: Rows, keys: jax.Array) -> tuple[jax.Array, Metrics]:
         return task.loss(nnx.merge(graph, params), rows, keys)
 
     def updates(
-        state: OnlineState, pool: Rows, rows: jax.Array, rates: Float[Array, " n"]
-    ) -> tuple[OnlineState, Metrics]:
-        def step(state: OnlineState, rate: jax.Array) -> tuple[OnlineState, Metrics]:
+        state: TrainState, pool: Rows, rows: jax.Array, rates: Float[Array, " n"]
+    ) -> tuple[TrainState, jax.Array, Metrics]:
+        def step(state: TrainState, rate: jax.Array) -> tuple[TrainState, Metrics]:
             draw, noise = jax.random.split(_key(seed, state.step))
             chosen = jax.random.randint(draw, (batch,), 0, rows)
             examples = as_floats({name: array[chosen] for name, array in pool.items()})
-            return updater.update(loss, state, examples, task.keys(noise, batch), rate)
+            return advance(state, loss, examples, task.keys(noise, batch), training, rate)
 
         state, metrics = jax.lax.scan(step, state, rates, length=count)
-        return state, jax.tree.map(jnp.mean, metrics)
+        skipped = (metrics["consecutive_skips"] > 0).sum()
+        return state, skipped, jax.tree.map(jnp.mean, _logged(metrics))
 
     return jax.jit(updates, donate_argnums=0)
 
 
 def make_decoder_update(
-    task: Refining, updater: Updater, graph: nnx.GraphDef, *, batch: int, seed: int
+    task: Refining, training: TrainConfig, graph: nnx.GraphDef, *, seed: int
 ) -> Any:
     """Return the jitted decoder update on random rows of a frame pool.
 
     It takes state, frozen weights, the pool's arrays, its number of rows, the fraction of latents
     that are generated ones, and the learning rate.
     """
+    batch = training.batch_size
 
     def update(
-        state: OnlineState,
+        state: TrainState,
         frozen: nnx.State,
         pool: Rows,
         rows: jax.Array,
         generated: jax.Array,
         rate: jax.Array,
-    ) -> tuple[OnlineState, Metrics]:
+    ) -> tuple[TrainState, Metrics]:
         def loss(params: nnx.State, batch: Any, key: jax.Array) -> tuple[jax.Array, Metrics]:
             latents, video = batch
             return task.decoding_loss(nnx.merge(graph, params, frozen).vae, latents, video, key)
@@ -158,9 +95,15 @@ def make_decoder_update(
             own[:, None, None, None, None], pool["latents"][chosen], pool["generated"][chosen]
         )
         examples = latents.astype(jnp.float32), to_model(pool["frames"][chosen])
-        return updater.update(loss, state, examples, frames, rate)
+        state, metrics = advance(state, loss, examples, frames, training, rate)
+        return state, _logged(metrics)
 
     return jax.jit(update, donate_argnums=0)
+
+
+def _logged(metrics: Metrics) -> Metrics:
+    """Return the metrics of an update that a run logs: the loss, and the task's."""
+    return {n: v for n, v in metrics.items() if n not in ("grad_norm", "lr", "consecutive_skips")}
 
 
 def make_generate(model: ModelConfig, graph: nnx.GraphDef, *, batch: int) -> Any:

@@ -47,7 +47,6 @@ class Autoencoding:
     """Weight of the KL term."""
 
     def __post_init__(self) -> None:
-        """Raise `InputError` for a crop larger than the video, or one the VAE cannot encode."""
         for name, crop, size in zip(
             ("rows", "columns"), self.crop, (self.video.height, self.video.width), strict=True
         ):

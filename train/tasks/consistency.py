@@ -40,7 +40,6 @@ class Consistency(Denoising):
         """None: there is no critic."""
 
     def __post_init__(self) -> None:
-        """Also raise `InputError` for a model without chunks, and for fewer than two points."""
         super().__post_init__()
         chunks_of(self.model)
         if self.points < 2:

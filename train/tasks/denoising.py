@@ -56,7 +56,6 @@ class Denoising:
     This is DWM's regularizer, which no release of it uses."""
 
     def __post_init__(self) -> None:
-        """Raise `InputError` for navigation or change weights without the inputs they need."""
         if not 0 <= self.navigation <= 1:
             raise InputError(
                 f"The rate of samples without hands must be in [0, 1], not {self.navigation}. "

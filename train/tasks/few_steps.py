@@ -39,7 +39,6 @@ class FewSteps(Denoising):
     """Fraction of a batch with noisy targets at random times."""
 
     def __post_init__(self) -> None:
-        """Also raise `InputError` for students, predictions without a velocity, and shares."""
         super().__post_init__()
         if self.model.chunks is not None or self.model.process.prediction not in ("velocity", "v"):
             raise InputError(

@@ -63,7 +63,6 @@ class Matching(Denoising):
     """Training of the critic; None: the defaults."""
 
     def __post_init__(self) -> None:
-        """Also raise `InputError` for a model without chunks, and for weights below 0."""
         super().__post_init__()
         chunks_of(self.model)
         if min(self.matching, self.regression) < 0 or not self.matching + self.regression:

@@ -24,7 +24,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Float, Key
 
 from egosim_jax.conditioning.pixels import to_model
 from egosim_jax.configs.model import Networks
@@ -57,7 +57,6 @@ class Refining(Autoencoding):
     """Trained part; decoder: the latents do not change."""
 
     def __post_init__(self) -> None:
-        """Also raise `InputError` for crops or frames that LPIPS cannot compare."""
         super().__post_init__()
         if self.perceptual_weight and min(self.crop) < MIN_CROP:
             raise InputError(
@@ -85,11 +84,9 @@ class Refining(Autoencoding):
         self, networks: Networks, batch: Batch, keys: Key[Array, " b"]
     ) -> tuple[jax.Array, Metrics]:
         """Return the loss of the module docstring, for sampled latents."""
-        draw = jax.random.fold_in(keys[0], 1)
-        _, loss, metrics = self.refinement_loss(
-            networks.vae, to_model(batch["video"]), keys[0], self._draw_frames(draw)
-        )
-        return loss, metrics
+        video = to_model(batch["video"])
+        decoded, loss, metrics = self.reconstruct(networks.vae, video, keys[0])
+        return self._with_lpips(loss, metrics, decoded, video, jax.random.fold_in(keys[0], 1))
 
     def squared_error(
         self, decoded: Float[Array, "b f h w 3"], video: Float[Array, "b f h w 3"]
@@ -98,17 +95,6 @@ class Refining(Autoencoding):
         if not self.motion_weight:
             return super().squared_error(decoded, video)
         return (motion_weights(video, self.motion_weight) * jnp.square(decoded - video)).mean()
-
-    def refinement_loss(
-        self,
-        vae: Any,
-        video: Float[Array, "b f h w 3"],
-        key: Key[Array, ""],
-        frames: Int[Array, " n"],
-    ) -> tuple[Float[Array, "b f h w 3"], jax.Array, Metrics]:
-        """Return the output of `reconstruct`; the loss also has LPIPS of the given frames."""
-        decoded, loss, metrics = self.reconstruct(vae, video, key)
-        return decoded, *self._with_lpips(loss, metrics, decoded, video, frames)
 
     def decoding_loss(
         self,
@@ -123,12 +109,7 @@ class Refining(Autoencoding):
         """
         decoded = vae.decode_whole(vae.denormalize(latents))
         loss, metrics = self.compare(decoded, video)
-        return self._with_lpips(loss, metrics, decoded, video, self._draw_frames(key))
-
-    def _draw_frames(self, key: Key[Array, ""]) -> Int[Array, " n"]:
-        """Return random frames that the perceptual term compares."""
-        count = self.perceptual_frames
-        return jax.random.choice(key, self.video.frames, (count,), replace=False)
+        return self._with_lpips(loss, metrics, decoded, video, key)
 
     def _with_lpips(
         self,
@@ -136,11 +117,13 @@ class Refining(Autoencoding):
         metrics: Metrics,
         decoded: Float[Array, "b f h w 3"],
         video: Float[Array, "b f h w 3"],
-        frames: Int[Array, " n"],
+        key: Key[Array, ""],
     ) -> tuple[jax.Array, Metrics]:
-        """Return loss and metrics with the perceptual term of some frames."""
+        """Return loss and metrics with the perceptual term of random frames."""
         if not self.perceptual_weight:
             return loss, metrics
+        count = self.perceptual_frames
+        frames = jax.random.choice(key, self.video.frames, (count,), replace=False)
         distance = lpips(decoded[:, frames], video[:, frames]).mean()
         return loss + self.perceptual_weight * distance, {**metrics, "lpips": distance}
 

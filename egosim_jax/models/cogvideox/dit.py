@@ -28,7 +28,7 @@ from egosim_jax.models.cogvideox.layers import (
     TimeEmbedding,
 )
 from egosim_jax.models.layers import LayerNorm, Linear, modulate, scan_blocks, stack, zeros
-from egosim_jax.models.patch import PatchEmbedding, check_condition
+from egosim_jax.models.patch import PatchEmbedding
 from egosim_jax.sharding import constrain
 from egosim_jax.types import InputError
 
@@ -137,14 +137,7 @@ class CogVideoXDiT(nnx.Module):
     def __init__(self, config: CogVideoXDiTConfig, *, rngs: nnx.Rngs):
         self.config = config
         dtype = config.dtype
-        self.patch = PatchEmbedding(
-            config.in_channels,
-            config.dim,
-            noisy_channels=config.out_channels,
-            patch=PATCH,
-            dtype=dtype,
-            rngs=rngs,
-        )
+        self.patch = PatchEmbedding(config, patch=PATCH, rngs=rngs)
         axes = (None, "embed")
         self.text = Linear(config.text_dim, config.dim, axes=axes, dtype=dtype, rngs=rngs)
         self.time = TimeEmbedding(config, rngs=rngs)
@@ -167,7 +160,9 @@ class CogVideoXDiT(nnx.Module):
         `condition` holds the channels after the noisy ones, `text` the text encoder's tokens;
         there is no image branch. Raises `InputError` for other channels, sizes or an image.
         """
-        self._check(condition.shape, has_image=image is not None)
+        self.patch.check(condition.shape)
+        if image is not None:
+            raise InputError("Image tokens were given to CogVideoX, which has no image branch.")
         _, f, h, w, _ = condition.shape
         rows, columns, eighth = h // PATCH, w // PATCH, self.config.head_dim // 16
         positions = grid_positions(f, rows, columns, self.config)
@@ -220,13 +215,3 @@ class CogVideoXDiT(nnx.Module):
         """Return the prediction for noisy latents and condition in one array."""
         noisy, condition = jnp.split(latents, [self.config.out_channels], axis=-1)
         return self.denoise(noisy, t, self.prepare(condition, text))
-
-    def _check(self, condition: tuple[int, ...], *, has_image: bool) -> None:
-        check_condition(
-            condition,
-            in_channels=self.config.in_channels,
-            noisy_channels=self.config.out_channels,
-            patch=PATCH,
-        )
-        if has_image:
-            raise InputError("Image tokens were given to CogVideoX, which has no image branch.")

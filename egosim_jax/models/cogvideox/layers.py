@@ -74,7 +74,6 @@ class CogVideoXDiTSizes:
     """Activations that the backward pass recomputes."""
 
     def __post_init__(self) -> None:
-        """Check that the sizes fit each other and the kernel fits the dtype."""
         sizes = (
             "out_channels", "dim", "heads", "layers", "text_dim", "time_dim",
             "base_rows", "base_columns",

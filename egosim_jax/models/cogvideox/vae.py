@@ -72,7 +72,6 @@ class CogVideoXVAEConfig:
     """Dtype of the convolutions; norms are computed in float32."""
 
     def __post_init__(self) -> None:
-        """Check that the strides are 4 x 8 x 8 and that groups divide the channels."""
         check_counts({name: getattr(self, name) for name in ("z_dim", "res_blocks", "groups")})
         if len(self.dims) != 4 or self.temporal_levels != 2:
             raise InputError(

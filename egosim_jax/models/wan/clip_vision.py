@@ -55,7 +55,6 @@ class CLIPVisionConfig:
     """Dtype of the linears and of the residual stream; norms and softmax are float32."""
 
     def __post_init__(self) -> None:
-        """Check that patches tile the image, heads the width, and that a block remains."""
         if self.image_size < self.patch or self.image_size % self.patch:
             raise InputError(
                 f"Patches of {self.patch} pixels do not tile an image of {self.image_size}: "

@@ -29,7 +29,7 @@ from jaxtyping import Array, Float
 from egosim_jax.models import Flops, remat, rope
 from egosim_jax.models.chunks import Chunks
 from egosim_jax.models.layers import scan_blocks, stack
-from egosim_jax.models.patch import PatchEmbedding, check_condition
+from egosim_jax.models.patch import PatchEmbedding
 from egosim_jax.models.wan.causal import CACHE, KeyValueCache, by_run, cached, packed, whole
 from egosim_jax.models.wan.layers import (
     MLP,
@@ -170,14 +170,7 @@ class WanDiT(nnx.Module):
 
     def __init__(self, config: WanDiTConfig, *, rngs: nnx.Rngs):
         self.config = config
-        self.patch = PatchEmbedding(
-            config.in_channels,
-            config.dim,
-            noisy_channels=config.out_channels,
-            patch=PATCH,
-            dtype=config.dtype,
-            rngs=rngs,
-        )
+        self.patch = PatchEmbedding(config, patch=PATCH, rngs=rngs)
         self.time = TimeEmbedding(config, rngs=rngs)
         sizes = (config.text_dim, config.dim, config.dim)
         self.text = MLP(config, sizes, gelu_tanh, init=normal, rngs=rngs)
@@ -197,7 +190,7 @@ class WanDiT(nnx.Module):
         `condition` holds the channels after the noisy ones (none for text to video), `text` the
         text encoder's tokens, `image` the image encoder's, for models with the image branch.
         """
-        self._check(condition.shape)
+        self.patch.check(condition.shape)
         return self.prepare_chunk(condition, self.share(text, image), 0)
 
     def share(
@@ -225,7 +218,7 @@ class WanDiT(nnx.Module):
         first_frame: int,
     ) -> DiTContext:
         """Compute the context that all denoising steps of a chunk share, by its condition."""
-        self._check(condition.shape)
+        self.patch.check(condition.shape)
         _, f, h, w, _ = condition.shape
         sizes = h // PATCH, w // PATCH, self.config.head_dim
         before = first_frame * sizes[0] * sizes[1]
@@ -349,14 +342,6 @@ class WanDiT(nnx.Module):
         """Return the velocity for noisy latents and condition in one array."""
         noisy, condition = jnp.split(latents, [self.config.out_channels], axis=-1)
         return self.denoise(noisy, t, self.prepare(condition, text, image))
-
-    def _check(self, condition: tuple[int, ...]) -> None:
-        check_condition(
-            condition,
-            in_channels=self.config.in_channels,
-            noisy_channels=self.config.out_channels,
-            patch=PATCH,
-        )
 
     def _check_image(self, *, has_image: bool) -> None:
         config = self.config

@@ -110,7 +110,6 @@ class WanDiTSizes:
     """Activations that the backward pass recomputes."""
 
     def __post_init__(self) -> None:
-        """Check that the sizes fit each other and the kernel fits the dtype."""
         sizes = ("out_channels", "dim", "ffn_dim", "heads", "layers", "text_dim", "freq_dim")
         check_counts({name: getattr(self, name) for name in sizes})
         if self.in_channels < self.out_channels:

@@ -80,7 +80,6 @@ class WanVAEConfig:
     """Dtype of the convolutions; norms are computed in float32."""
 
     def __post_init__(self) -> None:
-        """Check that the strides are 4 x 8 x 8 and that the statistics fit the latents."""
         if len(self.dim_mult) != 4 or len(self.temporal_downsample) != 3:
             raise InputError(
                 f"{len(self.dim_mult)} levels with {len(self.temporal_downsample)} steps between "

@@ -13,12 +13,6 @@ def frames():
     return np.random.default_rng(0).integers(0, 256, (13, 32, 48), np.uint8)
 
 
-def one_pixel(frame, row, column, shape=(61, 32, 48)):
-    frames = np.zeros(shape, np.uint8)
-    frames[frame, row, column] = 255
-    return frames
-
-
 def test_the_whole_rule_on_a_random_video(frames):
     packed = pack_mask(frames)
     padded = [*frames, frames[-1], frames[-1], frames[-1], frames[-1]][: 4 * 4 + 1]
@@ -39,45 +33,6 @@ def test_the_whole_rule_on_a_random_video(frames):
 def test_the_threshold_is_one_half_of_white(gray, generate):
     packed = pack_mask(np.full((5, 16, 16), gray, np.uint8))
     assert (packed[1] == generate).all()
-
-
-def test_latent_frame_i_is_decided_by_pixel_frame_4i():
-    for frame in range(1, 61):
-        packed = pack_mask(one_pixel(frame, 0, 0))
-        expected = [int(4 * i == frame) for i in range(16)]
-        assert packed.max(axis=(1, 2, 3)).tolist() == expected, frame
-
-
-def test_without_padding_the_frames_are_those_of_the_continuous_runner():
-    frames = np.zeros((61, 16, 16), np.uint8)
-    chosen = [0, 3, 7, 11, 15, 19, 22, 26, 30, 34, 38, 41, 45, 49, 53, 57]
-    frames[chosen] = 255
-    assert pack_mask(frames, padding="none").min(axis=(1, 2, 3)).tolist() == [0] + [1] * 15
-    frames = 255 - frames
-    assert pack_mask(frames, padding="none").max() == 0
-
-
-@pytest.mark.parametrize("dh", [0, 1])
-@pytest.mark.parametrize("dw", [0, 1])
-def test_channel_2dh_plus_dw_holds_pixel_8i_plus_4dh_8j_plus_4dw(dh, dw):
-    packed = pack_mask(one_pixel(8, 8 * 3 + 4 * dh, 8 * 5 + 4 * dw))
-    assert np.argwhere(packed).tolist() == [[2, 3, 5, 2 * dh + dw]]
-
-
-def test_pixels_between_the_selected_ones_do_not_count():
-    frames = np.full((5, 16, 16), 255, np.uint8)
-    frames[:, ::4, ::4] = 0
-    assert pack_mask(frames).max() == 0
-
-
-def test_a_length_that_the_vae_cannot_encode_is_refused():
-    with pytest.raises(InputError, match=r"4k\+1"):
-        pack_mask(np.zeros((62, 16, 16), np.uint8))
-
-
-def test_a_size_without_whole_latent_cells_is_refused():
-    with pytest.raises(InputError, match="16 x 20"):
-        pack_mask(np.zeros((5, 16, 20), np.uint8))
 
 
 def test_a_single_channel_holds_the_pixel_of_the_cell_in_the_frame_of_its_latent(frames):
@@ -109,3 +64,9 @@ def test_a_constant_mask_is_zero_and_refuses_holes(frames):
     assert packed.max() == 0
     with pytest.raises(InputError, match=r"% of the pixels were not observed: .*--prior static"):
         pack_mask(frames, packing="observed", channels=3)
+
+
+@pytest.mark.parametrize(("shape", "message"), [((62, 16, 16), r"4k\+1"), ((5, 16, 20), "16 x 20")])
+def test_a_video_without_whole_latent_cells_is_refused(shape, message):
+    with pytest.raises(InputError, match=message):
+        pack_mask(np.zeros(shape, np.uint8))

@@ -45,10 +45,6 @@ def test_black_pixels_get_no_noise():
     assert float(noisy[:, :, 4:].std()) == pytest.approx(0.0563, rel=0.1)
 
 
-def test_encoding_has_no_noise_unless_it_is_asked_for():
-    assert not any(vars(EncodingNoise()).values())
-
-
 def test_a_negative_deviation_is_refused():
     with pytest.raises(InputError, match="prior_pixels must be at least 0, not -1"):
         EncodingNoise(prior_pixels=-1.0)

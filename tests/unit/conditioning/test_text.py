@@ -99,26 +99,21 @@ def test_characters_outside_the_vocabulary_become_bytes_and_not_unknown(folder):
     assert tokens.ids[0].tolist() == [4, blank, first_byte + 0xC3, first_byte + 0xBC, 1, 0]
 
 
-def test_a_missing_tokenizer_folder_is_refused_with_what_is_needed(tmp_path):
-    tokenizer = PromptTokenizer(kind=tmp_path / "umt5-xxl")
-    with pytest.raises(InputError, match=r"tokenizer\.json or spiece\.model.*\(CogVideoX\)"):
-        tokenizer.tokenize(["a"])
-
-
-def test_a_tokenizer_file_that_cannot_be_read_is_refused(tmp_path):
-    (tmp_path / "tokenizer.json").write_text("{")
-    with pytest.raises(InputError, match="not a readable tokenizer"):
+@pytest.mark.parametrize(
+    ("file", "message"),
+    [
+        (None, r"tokenizer\.json or spiece\.model.*\(CogVideoX\)"),
+        ("{", "not a readable tokenizer"),
+        (Tokenizer(Unigram([("<unk>", 0.0), ("a", -1.0)], unk_id=0)).to_str(), "<pad> must be id"),
+    ],
+    ids=["missing", "damaged", "another family"],
+)
+def test_a_tokenizer_that_is_missing_damaged_or_of_another_family_is_refused(
+    tmp_path, file, message
+):
+    if file is not None:
+        (tmp_path / "tokenizer.json").write_text(file)
+    with pytest.raises(InputError, match=message):
         PromptTokenizer(kind=tmp_path).tokenize(["a"])
-
-
-def test_a_tokenizer_of_another_family_is_refused(tmp_path):
-    Tokenizer(Unigram([("<unk>", 0.0), ("a", -1.0)], unk_id=0)).save(
-        str(tmp_path / "tokenizer.json")
-    )
-    with pytest.raises(InputError, match="<pad> must be id 0"):
-        PromptTokenizer(kind=tmp_path).tokenize(["a"])
-
-
-def test_a_length_without_room_for_the_end_token_is_refused():
     with pytest.raises(InputError, match="max_tokens 0"):
         PromptTokenizer(max_tokens=0)

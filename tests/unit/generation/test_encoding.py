@@ -66,13 +66,6 @@ def test_pixels_of_the_prior_alone_get_noise_unless_they_are_black(clip):
     assert not same(added[0], added[1])
 
 
-def test_noise_of_hands_and_of_the_prior_do_not_depend_on_each_other(clip):
-    both = EncodingNoise(hands=True, prior_pixels=0.2)
-    hands, prior = EncodingNoise(hands=True), EncodingNoise(prior_pixels=0.2)
-    assert same(latents(clip, "hands", both), latents(clip, "hands", hands))
-    assert same(latents(clip, "prior", both), latents(clip, "prior", prior))
-
-
 def test_image_tokens_without_an_encoder_are_zeros_unless_a_clip_has_others(clip):
     zeros = np.zeros((3, DIT.image_dim), np.float32)
     np.testing.assert_array_equal(pack([clip], TOKENS)["image"], zeros[None])

@@ -114,7 +114,6 @@ def test_keys_that_are_added_for_cudnn_change_nothing(keys):
     ("platform", "kind", "dtype", "size", "kernel"),
     [
         ("cpu", "cpu", "float32", 128, "xla"),
-        ("gpu", "NVIDIA A100-SXM4-80GB", "bfloat16", 128, "cudnn"),
         ("gpu", "NVIDIA B200", "bfloat16", 128, "cudnn"),
         ("gpu", "NVIDIA H100 80GB HBM3", "bfloat16", 128, "hopper"),
         ("gpu", "NVIDIA H200", "bfloat16", 128, "hopper"),

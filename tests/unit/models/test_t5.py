@@ -54,14 +54,6 @@ def test_bfloat16_stays_close_to_float32(model):
     assert np.linalg.norm(have.astype(np.float32) - want) <= 0.03 * np.linalg.norm(want)
 
 
-def test_every_weight_names_one_logical_axis_a_dimension():
-    model = nnx.eval_shape(lambda: UMT5Config(**SIZES).build(rngs=nnx.Rngs(0)))
-    for path, leaf in nnx.to_flat_state(nnx.state(model)):
-        axes = leaf.get_metadata()["axes"]
-        assert len(axes) == len(leaf.shape), path
-        assert (axes[0] == "layers") == (path[0] == "blocks"), path
-
-
 def test_scores_start_with_the_variance_that_scaled_attention_has():
     config = UMT5Config(vocab=64, dim=256, ffn_dim=8, heads=4, head_dim=64, layers=1)
     attn = Attention(config, rngs=nnx.Rngs(0))

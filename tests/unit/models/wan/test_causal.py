@@ -117,7 +117,7 @@ def test_a_cache_of_another_clip_or_size_is_refused():
 
 @pytest.mark.parametrize(
     ("sizes", "message"),
-    [((), "at least one chunk"), ((2, 0), r"sizes\[1\]"), ((2, 2), r"2 \+ 2 .* have 3")],
+    [((), "at least one chunk"), ((2, 0), r"sizes\[1\]")],
 )
 def test_chunks_that_do_not_make_the_clip_are_refused(sizes, message):
     with pytest.raises(InputError, match=message):

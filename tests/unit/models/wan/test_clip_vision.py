@@ -42,14 +42,6 @@ def test_bfloat16_stays_close_to_float32():
     assert np.linalg.norm(have.astype(np.float32) - want) <= 0.03 * np.linalg.norm(want)
 
 
-def test_every_weight_names_one_logical_axis_a_dimension():
-    model = nnx.eval_shape(lambda: CLIPVision(CLIPVisionConfig(**SIZES), rngs=nnx.Rngs(0)))
-    for path, leaf in nnx.to_flat_state(nnx.state(model)):
-        axes = leaf.get_metadata()["axes"]
-        assert len(axes) == len(leaf.shape), path
-        assert (axes[0] == "layers") == (path[0] == "blocks"), path
-
-
 @pytest.mark.parametrize(
     "sizes", [{"image_size": 50}, {"image_size": 7}, {"heads": 5}, {"skip_last": 3}]
 )

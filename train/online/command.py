@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-from egosim_jax.runtime import command
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.train.online.plan import OnlineTraining
 
@@ -21,20 +18,3 @@ class Online(OnlineTraining):
 
         OnlineRun(self).train()
         return ExitCode.DONE
-
-
-def main(
-    args: Sequence[str] | None = None, *, program: str = "python -m egosim_jax.train.online"
-) -> int:
-    """Parse the command line and train."""
-    return command.main(
-        Online,
-        program=program,
-        description="Train while other processes make scenes. The same command resumes an "
-        "interrupted run.",
-        args=args,
-    )
-
-
-if __name__ == "__main__":
-    sys.exit(main())
