@@ -23,7 +23,7 @@ is kept.
 
 from __future__ import annotations
 
-from egosim_jax.types.cameras import FOCAL_WIDTHS, MAX_SKEW, Cameras, is_rigid
+from egosim_jax.types.cameras import FOCAL_WIDTHS, MAX_SKEW, Cameras, check_rigid, is_rigid
 from egosim_jax.types.data import (
     HAND_SIZE_M,
     JOINTS,
@@ -37,6 +37,7 @@ from egosim_jax.types.data import (
     SceneState,
     Triplet,
     View,
+    check_hands,
     near_view,
     object_name,
 )
@@ -82,6 +83,8 @@ __all__ = [
     "VideoSpec",
     "View",
     "check_counts",
+    "check_hands",
+    "check_rigid",
     "check_seed",
     "check_video",
     "is_rigid",

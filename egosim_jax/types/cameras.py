@@ -46,14 +46,7 @@ class Cameras(Shown):
                     f"{name} is {dtype or type(value).__name__} {have}: it must be an array of "
                     "numbers, with at least one frame of poses."
                 )
-        rigid = is_rigid(self.world_from_camera)
-        if not rigid.all():
-            frame = int(np.argmin(rigid))
-            raise InputError(
-                f"Camera pose at frame {frame} is not a rigid transform: it must be finite, with "
-                "a rotation of determinant 1 and the last row 0 0 0 1, not "
-                f"{self.world_from_camera[frame].tolist()}."
-            )
+        check_rigid(self.world_from_camera)
         self._check_intrinsics()
 
     def _check_intrinsics(self) -> None:
@@ -77,6 +70,18 @@ class Cameras(Shown):
                 f"{high:g}, the principal point inside the image. Do not transpose or normalize "
                 "them, and scale them to the clip's size."
             )
+
+
+def check_rigid(world_from_camera: Float[np.ndarray, "f 4 4"]) -> None:
+    """Raise `InputError` at the first camera pose that is not a rigid transform."""
+    rigid = is_rigid(world_from_camera)
+    if not rigid.all():
+        frame = int(np.argmin(rigid))
+        raise InputError(
+            f"Camera pose at frame {frame} is not a rigid transform: it must be finite, with a "
+            "rotation of determinant 1 and the last row 0 0 0 1, not "
+            f"{world_from_camera[frame].tolist()}."
+        )
 
 
 def is_rigid(poses: Float[np.ndarray, "f 4 4"]) -> Bool[np.ndarray, " f"]:
