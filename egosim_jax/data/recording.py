@@ -41,21 +41,22 @@ from egosim_jax.io.digest import sha256
 from egosim_jax.io.images import read_depth_image
 from egosim_jax.io.run import write_json
 from egosim_jax.io.untrusted.npz import read_arrays
-from egosim_jax.io.video import Video, read_moments, read_video
+from egosim_jax.io.video import Video, VideoInfo, read_moments, read_video
 from egosim_jax.types import (
-    HAND_SIZE_M,
-    JOINTS,
     Action,
     Cameras,
     InputError,
     Kind,
     check_counts,
-    is_rigid,
+    check_hands,
+    check_rigid,
     near_view,
 )
 
 FORMAT, VERSION = "egosim_jax.recording", 1
 ARRAYS = "arrays.npz"
+UNNAMED = "recording"
+"""Id of a recording until an import names it."""
 MAX_FRAMES = 1 << 20
 """Maximum length of a recording in frames: about ten hours."""
 MAX_BYTES = 1 << 28
@@ -157,6 +158,12 @@ class Recording:
                 f"Points are observed in frames {seen.min()} to {seen.max()}: the recording has "
                 f"{self.frames}, counted from 0."
             )
+
+    @classmethod
+    def of_video(cls, video: Path, info: VideoInfo, **fields: Any) -> Recording:
+        """Return a recording of a video: of all frames, unless `fields` say which, and unnamed."""
+        size = {"frames": info.frames, "height": info.height, "width": info.width}
+        return cls(**{"recording_id": UNNAMED, "video": video, "fps": info.fps, **size, **fields})
 
     @property
     def cameras(self) -> Cameras | None:
@@ -319,12 +326,7 @@ class Recording:
                     f"world_from_camera is {getattr(poses, 'dtype', '')} {np.shape(poses)}: it "
                     f"must be floats ({self.frames}, 4, 4), one pose per frame, or None."
                 )
-            rigid = is_rigid(poses)
-            if not rigid.all():
-                raise InputError(
-                    f"Camera pose at frame {int(np.argmin(rigid))} is not a rigid transform: it "
-                    "must be finite, with a rotation of determinant 1 and the last row 0 0 0 1."
-                )
+            check_rigid(poses)
         if self.intrinsics_px is not None:
             Cameras(
                 world_from_camera=np.eye(4)[None],
@@ -344,23 +346,8 @@ class Recording:
             )
         if cameras is not None:
             Action(cameras=cameras, joints_m=joints, kind=self.kind, prompt="")
-            return
-        shape = (self.frames, *np.shape(joints)[1:2], JOINTS.get(self.kind, 0), 3)
-        finite = np.isfinite(joints) if np.shape(joints) == shape else np.zeros((1, 1, 1, 3), bool)
-        given = finite.all(axis=(2, 3))
-        hands = joints[given] if finite.shape == shape else np.zeros((0, 1, 3))
-        extent = np.linalg.norm(np.ptp(hands, axis=1), axis=-1)
-        low, high = HAND_SIZE_M
-        if (
-            finite.shape != shape
-            or (finite.any(axis=(2, 3)) != given).any()
-            or ((extent < low) | (extent > high)).any()
-        ):
-            raise InputError(
-                f"joints_m is {np.shape(joints)}: {quote(self.kind)} hands of {self.frames} frames "
-                f"must be ({self.frames}, hands, {JOINTS.get(self.kind)}, 3), each hand either "
-                f"all NaN or finite and {low} to {high} m large."
-            )
+        else:
+            check_hands(joints, self.kind, self.frames)
 
     def _check_depth(self, depth: DepthFiles) -> None:
         if len(depth.paths) != self.frames or not 0 < depth.unit_m < 1e3:

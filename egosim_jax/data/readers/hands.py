@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 
+from egosim_jax.data.recording import Recording
 from egosim_jax.types import HAND_SIZE_M, Cameras, InputError, near_view
 
 
@@ -40,3 +43,9 @@ def clean_joints(
         "hands_never_in_view": int((given & ~seen).sum()),
     }
     return joints, {name: str(count) for name, count in counts.items() if count}
+
+
+def with_joints(recording: Recording, joints_m: Float[np.ndarray, "f n j 3"] | None) -> Recording:
+    """Return a recording with clean joints; its provenance ends with the counts."""
+    joints, counts = clean_joints(joints_m, recording.cameras)
+    return replace(recording, joints_m=joints, provenance={**recording.provenance, **counts})

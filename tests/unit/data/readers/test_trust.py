@@ -11,7 +11,6 @@ from egosim_jax.data.readers.agibot import AgiBot
 from egosim_jax.data.readers.egosim import EgoSimClips
 from egosim_jax.data.readers.nerfstudio import Nerfstudio
 from egosim_jax.data.readers.record3d import Record3D
-from egosim_jax.data.readers.taste_rob import TasteRob
 from tests.unit.data.readers import test_agibot, test_egosim, test_nerfstudio, test_record3d
 
 PLACEHOLDERS = {
@@ -58,13 +57,6 @@ def test_poses_that_jitter_are_known(world, tmp_path, imported, write):
     world.poses[:, 0, 3] = 1e-4 * np.random.default_rng(0).normal(size=world.frames)
     recording = imported(write(tmp_path / "scan", world))[0]["scan"]
     np.testing.assert_allclose(recording.world_from_camera, world.poses, atol=1e-9)
-
-
-def test_a_camera_that_its_dataset_calls_fixed_is_at_rest(world, tmp_path, imported):
-    world.write_video(tmp_path / "set/a.mp4")
-    (tmp_path / "set/t.csv").write_text("video,caption\na.mp4,Pick the cup\n")
-    recording = imported(TasteRob(source=tmp_path / "set"))[0]["a"]
-    assert (recording.world_from_camera == np.eye(4)).all()
 
 
 @pytest.mark.parametrize("write", [write_agibot, write_egosim])
