@@ -1,4 +1,4 @@
-"""Renderer of shaded meshes in JAX, which draws the same images as `mesh_reference`.
+"""Renderer of shaded meshes in JAX, which draws the same images as `reference`.
 
 With the corners a, b, c of a triangle in camera coordinates, a ray d from the camera leaves them on
 one side if d . (b x c), d . (c x a) and d . (a x b) have one sign. Divided by their sum they are

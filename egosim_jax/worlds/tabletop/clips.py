@@ -21,8 +21,7 @@ from egosim_jax.perception.oracle import motions_of
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.rendering.hand_mesh import pose_hands
 from egosim_jax.rendering.mesh import Side, hand_mask
-from egosim_jax.rendering.mesh_reference import draw_mesh
-from egosim_jax.rendering.reference import draw_hands, render
+from egosim_jax.rendering.reference import draw_hands, draw_mesh, render
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.state.silhouettes import unmix_colors
 from egosim_jax.types import (
