@@ -50,7 +50,7 @@ from egosim_jax.types import (
     check_counts,
     check_hands,
     check_rigid,
-    near_view,
+    seen_hands,
 )
 
 FORMAT, VERSION = "egosim_jax.recording", 1
@@ -242,12 +242,10 @@ class Recording:
             )
         poses, joints = self.world_from_camera, self.joints_m
         if joints is not None:
-            joints = joints[start:stop].copy()
+            joints = joints[start:stop]
         if joints is not None and self.cameras is not None:
-            shown = replace(
-                self.cameras, world_from_camera=self.cameras.world_from_camera[start:stop]
-            )
-            joints[:, ~near_view(shown, joints).any(axis=0)] = np.nan
+            path = self.cameras.world_from_camera[start:stop]
+            joints = seen_hands(replace(self.cameras, world_from_camera=path), joints)
         depth = self.depth and replace(self.depth, paths=self.depth.paths[start:stop])
         return replace(
             self,

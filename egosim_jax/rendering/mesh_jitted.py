@@ -40,8 +40,8 @@ def draw_mesh(
     for vertices_m, pose in zip(mesh.vertices_m, cameras.world_from_camera, strict=True):
         canvas = empty_canvas(tiles)
         vertices = transform(invert(pose), vertices_m)
-        given = np.isfinite(vertices).all(axis=1)[mesh.triangles].all(axis=1)
-        triangles = mesh.triangles[given]
+        complete = np.isfinite(vertices).all(axis=1)[mesh.triangles].all(axis=1)
+        triangles = mesh.triangles[complete]
         normals = vertex_normals(np.where(np.isfinite(vertices), vertices, 0.0), triangles)
         corners = vertices[triangles]
         shapes = {"corners": corners, "normals": normals[triangles]}

@@ -285,9 +285,9 @@ def draw_mesh(
     rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
     for frame, pose in enumerate(cameras.world_from_camera):
         vertices = transform(invert(pose), mesh.vertices_m[frame])
-        given = np.isfinite(vertices).all(axis=1)[mesh.triangles].all(axis=1)
-        if given.any():
-            _draw_triangles(image[frame], depth[frame], vertices, mesh, given, rays)
+        complete = np.isfinite(vertices).all(axis=1)[mesh.triangles].all(axis=1)
+        if complete.any():
+            _draw_triangles(image[frame], depth[frame], vertices, mesh, complete, rays)
     return image, depth
 
 
@@ -350,11 +350,11 @@ def _draw_triangles(
     depth: Float32[np.ndarray, "h w"],
     vertices: Float[np.ndarray, "v 3"],
     mesh: MovingMesh,
-    given: np.ndarray,
+    complete: np.ndarray,
     rays: Float[np.ndarray, "h w 3"],
 ) -> None:
     """Draw the given triangles of one frame, in camera coordinates."""
-    triangles = mesh.triangles[given]
+    triangles = mesh.triangles[complete]
     cast = _ray_caster(np.nan_to_num(vertices), triangles, threads=1)
     distance, seen, numbers, share = cast(NEAR_M * rays, rays)
     corners = triangles[numbers]

@@ -40,6 +40,7 @@ from egosim_jax.types.data import (
     check_hands,
     near_view,
     object_name,
+    seen_hands,
 )
 from egosim_jax.types.motion import Cause, How, Motion, ObjectPath
 from egosim_jax.types.settings import (
@@ -90,4 +91,5 @@ __all__ = [
     "is_rigid",
     "near_view",
     "object_name",
+    "seen_hands",
 ]

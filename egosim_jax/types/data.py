@@ -95,16 +95,24 @@ REACH_M = 3.0
 def near_view(cameras: Cameras, joints_m: Float[np.ndarray, "f n j 3"]) -> Bool[np.ndarray, "f n"]:
     """Return which hands have a joint within reach of the camera and in or near its image."""
     poses = cameras.world_from_camera
-    given = np.asarray(np.isfinite(joints_m).all(axis=(2, 3)))
-    where = np.where(given[:, :, None, None], joints_m, 0.0) - poses[:, None, None, :3, 3]
+    present = np.asarray(np.isfinite(joints_m).all(axis=(2, 3)))
+    where = np.where(present[:, :, None, None], joints_m, 0.0) - poses[:, None, None, :3, 3]
     x, y, z = np.moveaxis(np.einsum("fnjc,fcd->fnjd", where, poses[:, :3, :3]), -1, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         u = cameras.intrinsics_px[0, 0] * x / z + cameras.intrinsics_px[0, 2]
         v = cameras.intrinsics_px[1, 1] * y / z + cameras.intrinsics_px[1, 2]
     near_u, near_v = NEAR_IMAGE * cameras.width, NEAR_IMAGE * cameras.height
     seen = (z > 0) & (z < REACH_M) & (u > -near_u) & (u < cameras.width + near_u)
-    seen &= (v > -near_v) & (v < cameras.height + near_v) & given[..., None]
+    seen &= (v > -near_v) & (v < cameras.height + near_v) & present[..., None]
     return np.asarray(seen.any(axis=2))
+
+
+def seen_hands(
+    cameras: Cameras, joints_m: Float[np.ndarray, "f n j 3"]
+) -> Float[np.ndarray, "f n j 3"]:
+    """Return the joints with NaN for hands that are never near the view (`near_view`)."""
+    seen = np.asarray(near_view(cameras, joints_m).any(axis=0))[:, None, None]
+    return joints_m if seen.all() else np.where(seen, joints_m, np.nan)
 
 
 @no_type_check
@@ -122,8 +130,8 @@ def check_hands(
             f"cameras must be floats ({frames}, hands, {wanted}, 3), at least one hand. A missing "
             "hand has joints of NaN."
         )
-    given = np.asarray(np.isfinite(joints).all(axis=(2, 3)))
-    broken = ~given & ~np.isnan(joints).all(axis=(2, 3))
+    present = np.asarray(np.isfinite(joints).all(axis=(2, 3)))
+    broken = ~present & ~np.isnan(joints).all(axis=(2, 3))
     if broken.any():
         frame, hand = np.argwhere(broken)[0].tolist()
         raise InputError(
@@ -132,14 +140,14 @@ def check_hands(
         )
     extent = np.linalg.norm(np.ptp(joints, axis=2), axis=-1)
     low, high = HAND_SIZE_M
-    bad = given & ~((extent >= low) & (extent <= high))
+    bad = present & ~((extent >= low) & (extent <= high))
     if bad.any():
         frame, hand = np.argwhere(bad)[0].tolist()
         raise InputError(
             f"Hand {hand} of frame {frame} is {extent[frame, hand]:.4g} m large: a hand has {low} "
             f"to {high} m. Joints must be in meters."
         )
-    return given
+    return present
 
 
 @no_type_check
@@ -165,19 +173,19 @@ class Action(Shown):
         Raises `InputError`, also if a hand never comes near any camera's view: then it is not in
         world coordinates.
         """
-        given = check_hands(self.joints_m, self.kind, len(self.cameras.world_from_camera))
+        present = check_hands(self.joints_m, self.kind, len(self.cameras.world_from_camera))
         if not isinstance(self.prompt, str):
             raise InputError(f"The prompt must be text, not {type(self.prompt).__name__}.")
-        if given.any():
-            self._check_place(self.joints_m, given)
+        if present.any():
+            self._check_place(self.joints_m, present)
 
-    def _check_place(self, joints: np.ndarray, given: np.ndarray) -> None:
+    def _check_place(self, joints: np.ndarray, present: np.ndarray) -> None:
         """Raise `InputError` if no joint of a hand is within reach of a camera and near its image.
 
         Each hand that is given in any frame is checked separately.
         """
         seen = near_view(self.cameras, joints)
-        lost = given.any(axis=0) & ~seen.any(axis=0)
+        lost = present.any(axis=0) & ~seen.any(axis=0)
         if lost.any():
             raise InputError(
                 f"No joint of hand {int(np.argmax(lost))} comes near the view of the cameras, at "

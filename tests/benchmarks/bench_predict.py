@@ -22,9 +22,9 @@ import numpy as np
 
 from egosim_jax.dynamics import predict
 from egosim_jax.geometry import invert, transform
-from egosim_jax.types import Action, InputError, Kind, SceneState, VideoSpec
+from egosim_jax.types import Action, InputError, Kind, SceneState, VideoSpec, seen_hands
 from egosim_jax.worlds.tabletop import encounters, make_scripts
-from egosim_jax.worlds.tabletop.clips import first_view, provenance, seen_hands
+from egosim_jax.worlds.tabletop.clips import first_view, provenance
 from egosim_jax.worlds.tabletop.encounters import Encounter, Start
 from egosim_jax.worlds.tabletop.policies import POLICIES
 from egosim_jax.worlds.tabletop.scene import Scene

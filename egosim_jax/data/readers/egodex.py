@@ -117,12 +117,12 @@ class EgoDex:
         if not any(f"transforms/{name}" in arrays for name in names):
             return None, []
         frames = len(arrays["transforms/camera"])
-        given = {name: array for name, array in arrays.items() if len(array) == frames}
-        unknown = [path for name in names if (path := f"transforms/{name}") not in given]
+        complete = {name: array for name, array in arrays.items() if len(array) == frames}
+        unknown = [path for name in names if (path := f"transforms/{name}") not in complete]
         nowhere, certain = np.full((frames, 4, 4), np.nan), np.ones(frames)
-        moved = [given.get(f"transforms/{name}", nowhere)[:, :3, 3] for name in names]
+        moved = [complete.get(f"transforms/{name}", nowhere)[:, :3, 3] for name in names]
         joints = rearrange(np.stack(moved, axis=1), "f (n j) c -> f n j c", n=2)
-        confidences = [given.get(f"confidences/{name}", certain) for name in names]
+        confidences = [complete.get(f"confidences/{name}", certain) for name in names]
         confidence = rearrange(np.stack(confidences), "(n j) f -> f n j", n=2)
         joints[np.median(confidence, axis=2) < self.min_confidence] = np.nan
         return joints, unknown

@@ -30,9 +30,9 @@ def clean_joints(
     low, high = HAND_SIZE_M
     odd = finite & ~((extent >= low) & (extent <= high))
     joints[odd] = np.nan
-    given = np.isfinite(joints).all(axis=(2, 3)).any(axis=0)
-    seen = given if cameras is None else near_view(cameras, joints).any(axis=0)
-    if given.any() and not seen.any():
+    present = np.isfinite(joints).all(axis=(2, 3)).any(axis=0)
+    seen = present if cameras is None else near_view(cameras, joints).any(axis=0)
+    if present.any() and not seen.any():
         raise InputError(
             "No hand joint comes near the view of the camera in any frame: joints and camera poses "
             "must be in one world, in meters. The recording cannot be used for hands."
@@ -40,7 +40,7 @@ def clean_joints(
     joints[:, ~seen] = np.nan
     counts = {
         "hands_implausible": int(odd.sum()),
-        "hands_never_in_view": int((given & ~seen).sum()),
+        "hands_never_in_view": int((present & ~seen).sum()),
     }
     return joints, {name: str(count) for name, count in counts.items() if count}
 
