@@ -21,15 +21,20 @@ from egosim_jax.data.readers.taste_rob import TasteRob
 from egosim_jax.data.recording import Recording
 from egosim_jax.io.timing import Timeline, row_times
 from egosim_jax.io.video import probe_video, read_moments, read_video
-from egosim_jax.types import InputError, VideoSpec
+from egosim_jax.types import InputError
 from tests.captures import World
 from tests.films import EVEN, FILMS, FPS, FRAMES, HEIGHT, WIDTH, numbers, write_film, write_paused
-from tests.unit.data.readers import test_agibot, test_egodex, test_egosim, test_egovid, test_hot3d
+from tests.unit.data.readers import (
+    test_agibot,
+    test_egodex,
+    test_egosim,
+    test_egovid,
+    test_hot3d,
+    test_lerobot,
+)
+from tests.unit.data.readers.test_lerobot import KEY
 
 NTSC = Fraction(1, 30000)
-KEY = "observation.images.head"
-SPEC = VideoSpec(frames=9, height=HEIGHT, width=WIDTH)
-RATED = VideoSpec(frames=9, height=HEIGHT, width=WIDTH, fps=8)
 
 
 class Filmed(World):
@@ -47,16 +52,10 @@ class Filmed(World):
 def write_lerobot(root, film, rows, version, *, fps=FPS, starts=(0.0,), stamps=None):
     v3 = version == "v3.0"
     place = "file-{file_index}" if v3 else "episode_{episode_index}"
-    info = {
-        "codebase_version": version,
-        "fps": fps,
-        "features": {KEY: {"dtype": "video", "shape": [HEIGHT, WIDTH, 3]}},
-        "video_path": f"videos/{place}.mp4",
-        "data_path": f"data/{place}.parquet",
-    }
     for folder in ("meta/episodes/chunk-000", "videos", "data"):
         (root / folder).mkdir(parents=True)
-    (root / "meta/info.json").write_text(json.dumps(info))
+    paths = {"video_path": f"videos/{place}.mp4", "data_path": f"data/{place}.parquet"}
+    test_lerobot.write_info(root, version, fps=fps, **paths)
     count = len(starts)
     name = "file-0" if v3 else "episode_0"
     shutil.copy(film, root / f"videos/{name}.mp4")

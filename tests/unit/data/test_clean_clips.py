@@ -3,7 +3,6 @@
 import csv
 from fractions import Fraction
 
-import av
 import numpy as np
 import pytest
 from PIL import Image
@@ -18,7 +17,7 @@ from egosim_jax.data.shards import ShardReader
 from egosim_jax.io.video import probe_video, read_video
 from egosim_jax.io.writing import write_video
 from egosim_jax.types import VideoSpec
-from tests.captures import coded, shown
+from tests.captures import coded, encode, shown
 
 VIDEOS = {
     "video": "videos/0.mp4",
@@ -115,13 +114,8 @@ def test_annotation_takes_the_frames_nearest_in_time(fps, asked, taken, count, t
 def test_every_way_to_read_a_video_gives_the_frames_asked_for(
     suffix, codec, options, fps, tmp_path
 ):
-    path = tmp_path / f"video.{suffix}"
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=fps, options=options)
-        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
-        for frame in coded(30, 64, 96):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
-        container.mux(stream.encode())
+    frames, path = coded(30, 64, 96), tmp_path / f"video.{suffix}"
+    encode(path, frames, rate=fps, codec=codec, options=options)
     info = probe_video(path)
     assert (info.frames, info.width, info.height, info.fps) == (30, 96, 64, fps)
     np.testing.assert_allclose(info.timeline.times_s, np.arange(30) / float(fps), atol=2e-3)

@@ -2,7 +2,6 @@
 
 from fractions import Fraction
 
-import av
 import h5py
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ from egosim_jax.data.readers.agibot import AgiBot
 from egosim_jax.data.readers.egosim import EgoSimClips
 from egosim_jax.data.readers.nerfstudio import Nerfstudio
 from egosim_jax.data.readers.record3d import Record3D
+from tests.captures import encode
 from tests.unit.data.readers import test_agibot, test_egosim, test_nerfstudio, test_record3d
 
 PLACEHOLDERS = {
@@ -62,14 +62,7 @@ def test_poses_that_jitter_are_known(world, tmp_path, imported, write):
 @pytest.mark.parametrize("write", [write_agibot, write_egosim])
 def test_intrinsics_of_pixels_that_are_not_square_are_ambiguous(world, tmp_path, imported, write):
     reader, video = write(tmp_path / "set", world)
-    with av.open(str(video), "w") as container:
-        stream = container.add_stream("libx264", rate=30)
-        stream.width, stream.height, stream.pix_fmt = 96, world.height, "yuv420p"
-        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
-        for frame in world.video:
-            frame = av.VideoFrame.from_ndarray(frame, format="rgb24")
-            container.mux(stream.encode(frame.reformat(96, world.height)))
-        container.mux(stream.encode())
+    encode(video, world.video[:, :, :96], aspect=Fraction(4, 3))
     done, problems = imported(reader)
     assert not done
     assert "setsar=1" in next(iter(problems.values()))
