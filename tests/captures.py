@@ -26,6 +26,20 @@ def shown(frames, count):
     return np.rint(numbers).astype(int).tolist()
 
 
+def encode(path, frames, *, rate=30, codec="libx264", options=None, aspect=None):
+    """Write RGB frames as a video; return its path. Pixels are `aspect` times as wide as high."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=Fraction(rate), options=options)
+        (stream.height, stream.width), stream.pix_fmt = frames.shape[1:3], "yuv420p"
+        if aspect is not None:
+            stream.codec_context.sample_aspect_ratio = aspect
+        for frame in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+    return path
+
+
 class World:
     """A camera that moves by some centimeters, two hands before it, and a textured video."""
 
@@ -59,15 +73,9 @@ class World:
             self.video[index] = cv2.warpPerspective(texture, homography, (self.width, self.height))
 
     def write_video(self, path, *, fps=30, codec="libx264", repeat=1):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with av.open(str(path), "w") as container:
-            stream = container.add_stream(codec, rate=Fraction(fps))
-            stream.width, stream.height, stream.pix_fmt = self.width, self.height, "yuv420p"
-            stream.options = {"preset": "12" if codec == "libsvtav1" else "ultrafast", "crf": "12"}
-            for frame in [*self.video] * repeat:
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
-            container.mux(stream.encode())
-        return path
+        options = {"preset": "12" if codec == "libsvtav1" else "ultrafast", "crf": "12"}
+        frames = np.concatenate([self.video] * repeat)
+        return encode(path, frames, rate=fps, codec=codec, options=options)
 
     def assert_first(self, recording):
         """The corner of a frame shows its number: the recording's first must be ours."""

@@ -144,7 +144,7 @@ def check_clip(
     problems = []
     probed: dict[str, VideoInfo] = {}
     sizes: dict[str, tuple[int, int]] = {}
-    for name, path in _videos(files, policy).items():
+    for name, path in videos_of(files, policy).items():
         try:
             probed[name] = probe_video(path, damage=DAMAGE[policy])
             sizes[name] = (probed[name].height, probed[name].width)
@@ -191,7 +191,7 @@ def load_triplet(
     arrays: dict[str, np.ndarray] = {
         "mask": np.zeros((spec.frames, spec.height, spec.width), np.uint8)
     }
-    videos = _videos(files, policy)
+    videos = videos_of(files, policy)
     ratio = Fraction(1)
     if resampling in ("rate", "step"):
         probed = {name: probe_video(path, damage=DAMAGE[policy]) for name, path in videos.items()}
@@ -234,17 +234,12 @@ def _fit_mask(frame: UInt8[np.ndarray, "h w 3"], *, height: int, width: int) -> 
     return resize_mask(frame[None, ..., 0], height, width)[0]
 
 
-def _videos(files: ClipFiles, policy: Policy) -> dict[str, Path]:
+def videos_of(files: ClipFiles, policy: Policy = "strict") -> dict[str, Path]:
     """Return the videos to read; the lenient policy omits a missing mask or target."""
     videos = {"prior": files.prior, "hands": files.hands}
-    if files.mask is not None:
-        videos["mask"] = files.mask
-    if files.target is not None:
-        videos["target"] = files.target
-    if policy == "lenient":
-        for name in ("mask", "target"):
-            if name in videos and not videos[name].exists():
-                del videos[name]
+    for name, path in (("mask", files.mask), ("target", files.target)):
+        if path is not None and (policy == "strict" or path.exists()):
+            videos[name] = path
     return videos
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from egosim_jax.data.clip_files import ClipFiles
-from egosim_jax.data.clips import check_clip, encoded_first_frame, load_triplet
+from egosim_jax.data.clips import check_clip, encoded_first_frame, load_triplet, videos_of
 from egosim_jax.data.metadata import check_presence
 from egosim_jax.data.records import Record
 from egosim_jax.data.shards import ShardReader, ShardWriter
@@ -95,14 +95,9 @@ def encoded_record(files: ClipFiles, grid: VideoGrid = WAN_GRID, fps: int | None
     problems = check_clip(files, None, grid=grid, fps=fps)
     if problems:
         raise InputError(listing(problems))
-    paths = {"prior": files.prior, "hands": files.hands}
-    if files.mask is not None:
-        paths["mask"] = files.mask
-    if files.target is not None:
-        paths["target"] = files.target
     arrays = {
         name: np.frombuffer(read_bytes(path, limit=MAX_FILE_BYTES), np.uint8)
-        for name, path in paths.items()
+        for name, path in videos_of(files).items()
     }
     arrays["first_frame"] = np.frombuffer(encoded_first_frame(files.first_frame), np.uint8)
     return Record(arrays=arrays, metadata=clip_metadata(files))

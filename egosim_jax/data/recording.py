@@ -41,21 +41,22 @@ from egosim_jax.io.digest import sha256
 from egosim_jax.io.images import read_depth_image
 from egosim_jax.io.run import write_json
 from egosim_jax.io.untrusted.npz import read_arrays
-from egosim_jax.io.video import Video, read_moments, read_video
+from egosim_jax.io.video import Video, VideoInfo, read_moments, read_video
 from egosim_jax.types import (
-    HAND_SIZE_M,
-    JOINTS,
     Action,
     Cameras,
     InputError,
     Kind,
     check_counts,
-    is_rigid,
-    near_view,
+    check_hands,
+    check_rigid,
+    seen_hands,
 )
 
 FORMAT, VERSION = "egosim_jax.recording", 1
 ARRAYS = "arrays.npz"
+UNNAMED = "recording"
+"""Id of a recording until an import names it."""
 MAX_FRAMES = 1 << 20
 """Maximum length of a recording in frames: about ten hours."""
 MAX_BYTES = 1 << 28
@@ -158,6 +159,12 @@ class Recording:
                 f"{self.frames}, counted from 0."
             )
 
+    @classmethod
+    def of_video(cls, video: Path, info: VideoInfo, **fields: Any) -> Recording:
+        """Return a recording of a video: of all frames, unless `fields` say which, and unnamed."""
+        size = {"frames": info.frames, "height": info.height, "width": info.width}
+        return cls(**{"recording_id": UNNAMED, "video": video, "fps": info.fps, **size, **fields})
+
     @property
     def cameras(self) -> Cameras | None:
         """Cameras, if poses and intrinsics are known; in an unknown unit unless `metric`."""
@@ -235,12 +242,10 @@ class Recording:
             )
         poses, joints = self.world_from_camera, self.joints_m
         if joints is not None:
-            joints = joints[start:stop].copy()
+            joints = joints[start:stop]
         if joints is not None and self.cameras is not None:
-            shown = replace(
-                self.cameras, world_from_camera=self.cameras.world_from_camera[start:stop]
-            )
-            joints[:, ~near_view(shown, joints).any(axis=0)] = np.nan
+            path = self.cameras.world_from_camera[start:stop]
+            joints = seen_hands(replace(self.cameras, world_from_camera=path), joints)
         depth = self.depth and replace(self.depth, paths=self.depth.paths[start:stop])
         return replace(
             self,
@@ -319,12 +324,7 @@ class Recording:
                     f"world_from_camera is {getattr(poses, 'dtype', '')} {np.shape(poses)}: it "
                     f"must be floats ({self.frames}, 4, 4), one pose per frame, or None."
                 )
-            rigid = is_rigid(poses)
-            if not rigid.all():
-                raise InputError(
-                    f"Camera pose at frame {int(np.argmin(rigid))} is not a rigid transform: it "
-                    "must be finite, with a rotation of determinant 1 and the last row 0 0 0 1."
-                )
+            check_rigid(poses)
         if self.intrinsics_px is not None:
             Cameras(
                 world_from_camera=np.eye(4)[None],
@@ -344,23 +344,8 @@ class Recording:
             )
         if cameras is not None:
             Action(cameras=cameras, joints_m=joints, kind=self.kind, prompt="")
-            return
-        shape = (self.frames, *np.shape(joints)[1:2], JOINTS.get(self.kind, 0), 3)
-        finite = np.isfinite(joints) if np.shape(joints) == shape else np.zeros((1, 1, 1, 3), bool)
-        given = finite.all(axis=(2, 3))
-        hands = joints[given] if finite.shape == shape else np.zeros((0, 1, 3))
-        extent = np.linalg.norm(np.ptp(hands, axis=1), axis=-1)
-        low, high = HAND_SIZE_M
-        if (
-            finite.shape != shape
-            or (finite.any(axis=(2, 3)) != given).any()
-            or ((extent < low) | (extent > high)).any()
-        ):
-            raise InputError(
-                f"joints_m is {np.shape(joints)}: {quote(self.kind)} hands of {self.frames} frames "
-                f"must be ({self.frames}, hands, {JOINTS.get(self.kind)}, 3), each hand either "
-                f"all NaN or finite and {low} to {high} m large."
-            )
+        else:
+            check_hands(joints, self.kind, self.frames)
 
     def _check_depth(self, depth: DepthFiles) -> None:
         if len(depth.paths) != self.frames or not 0 < depth.unit_m < 1e3:

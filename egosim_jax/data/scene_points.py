@@ -40,8 +40,8 @@ class ScenePoints:
                 f"{MAX_POINTS:,} points. Give None if no point is known."
             )
         observations = self.frames, self.indices, self.pixels_px
-        given = [value is not None for value in observations]
-        if any(given) != all(given):
+        present = [value is not None for value in observations]
+        if any(present) != all(present):
             raise InputError("frames, indices and pixels_px of the points must be given together.")
         count = len(self.points_m)
         seen = 0 if self.frames is None else int(np.size(self.frames))

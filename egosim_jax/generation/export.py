@@ -13,7 +13,7 @@ from egosim_jax.dynamics import predict
 from egosim_jax.rendering import POINT_PX, PriorKind, Renderer, jitted
 from egosim_jax.rendering.hand_mesh import pose_hands
 from egosim_jax.rendering.mesh import MovingMesh
-from egosim_jax.rendering.mesh_reference import draw_scene
+from egosim_jax.rendering.reference import draw_scene
 from egosim_jax.simulation.actions import check_order
 from egosim_jax.state.ply import has_triangles, read_triangles
 from egosim_jax.state.snapshot import load, read_ply

@@ -142,21 +142,21 @@ def row_times(
     and for time stamps in another unit.
     """
     numbers = np.array([_seconds(stamp) for stamp in stamps], float)
-    given = np.flatnonzero(np.isfinite(numbers))
+    stamped = np.flatnonzero(np.isfinite(numbers))
     rate = next(filter(None, rates), None)
-    if rate and len(numbers) > 1 and len(np.unique(numbers[given])) < 2:
+    if rate and len(numbers) > 1 and len(np.unique(numbers[stamped])) < 2:
         logger.warning(
             "%s does not separate %d rows: row k is at k / %g s", name, len(numbers), float(rate)
         )
         return np.arange(len(numbers)), 0.0, Timeline.even(len(numbers), rate)
-    if not len(given):
+    if not len(stamped):
         raise InputError(
             f"{name} has no time stamps: a row must have a finite number of seconds. Write them, "
             "or remove the column."
         )
-    ordered, first = np.unique(numbers[given], return_index=True)
+    ordered, first = np.unique(numbers[stamped], return_index=True)
     if len(ordered) < len(numbers):
-        dropped = np.setdiff1d(np.arange(len(numbers)), given[first])
+        dropped = np.setdiff1d(np.arange(len(numbers)), stamped[first])
         logger.warning(
             "%s: %d of %d rows have no time stamp, or a repeated one; they are dropped, the first "
             "one is row %d", name, len(dropped), len(numbers), dropped[0],
@@ -171,7 +171,7 @@ def row_times(
             )
     timeline.check(name, fix="Cut it there, and use the parts.")
     timeline.report(name)
-    return given[first], float(ordered[0]), timeline
+    return stamped[first], float(ordered[0]), timeline
 
 
 def _seconds(value: Any) -> float:

@@ -80,10 +80,10 @@ def pose_hands(
 def _pose(joints_m: Float[np.ndarray, "f 21 3"], side: Side) -> MovingMesh:
     template = make_template()
     mirror = np.array([1.0 if side == "right" else -1.0, 1.0, 1.0])
-    given = np.isfinite(joints_m).all(axis=(1, 2))
+    present = np.isfinite(joints_m).all(axis=(1, 2))
     vertices = np.full((len(joints_m), *template.vertices_m.shape), np.nan)
-    if given.any():
-        vertices[given] = _skin(template, joints_m[given].astype(float) * mirror) * mirror
+    if present.any():
+        vertices[present] = _skin(template, joints_m[present].astype(float) * mirror) * mirror
     return MovingMesh(
         vertices_m=vertices,
         triangles=template.triangles if side == "right" else template.triangles[:, ::-1],

@@ -144,9 +144,8 @@ def read_mano(path: Path) -> Mano:
             f"{quote_path(path)} has joints {table.shape} and triangles {triangles.shape}: they "
             f"must be (2, {JOINTS}) and (t, 3). (--mano-right, --mano-left)"
         )
-    given = {name: arrays[name].astype(float) for name in names[:3]}
     return Mano(
-        **given,
+        **{name: arrays[name].astype(float) for name in names[:3]},
         j_regressor=arrays["J_regressor"].astype(float),
         weights=arrays["weights"].astype(float),
         parents=tuple(int(parent) for parent in table[0, 1:]),
@@ -197,14 +196,14 @@ def _pose(
     model: Mano, poses: ManoPoses, hand: int, add_mean: bool, mirrored: bool
 ) -> Float[np.ndarray, "f v 3"]:
     """Return the vertices of one hand, NaN where it is missing."""
-    given = poses.given[:, hand]
-    vertices = np.full((len(given), *model.v_template.shape), np.nan)
-    if given.any():
-        pose = poses.hand_pose[given, hand] + (model.hands_mean if add_mean else 0.0)
-        turns = np.concatenate([poses.global_orient[given, hand], pose], axis=-1)
+    present = poses.given[:, hand]
+    vertices = np.full((len(present), *model.v_template.shape), np.nan)
+    if present.any():
+        pose = poses.hand_pose[present, hand] + (model.hands_mean if add_mean else 0.0)
+        turns = np.concatenate([poses.global_orient[present, hand], pose], axis=-1)
         posed = skin(model, poses.betas[hand], turns.reshape(-1, JOINTS, 3))
         posed = posed * [-1, 1, 1] if mirrored else posed
-        vertices[given] = posed + poses.translation_m[given, hand, None]
+        vertices[present] = posed + poses.translation_m[present, hand, None]
     return vertices
 
 

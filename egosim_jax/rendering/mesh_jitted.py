@@ -1,4 +1,4 @@
-"""Renderer of shaded meshes in JAX, which draws the same images as `mesh_reference`.
+"""Renderer of shaded meshes in JAX, which draws the same images as `reference`.
 
 With the corners a, b, c of a triangle in camera coordinates, a ray d from the camera leaves them on
 one side if d . (b x c), d . (c x a) and d . (a x b) have one sign. Divided by their sum they are
@@ -40,8 +40,8 @@ def draw_mesh(
     for vertices_m, pose in zip(mesh.vertices_m, cameras.world_from_camera, strict=True):
         canvas = empty_canvas(tiles)
         vertices = transform(invert(pose), vertices_m)
-        given = np.isfinite(vertices).all(axis=1)[mesh.triangles].all(axis=1)
-        triangles = mesh.triangles[given]
+        complete = np.isfinite(vertices).all(axis=1)[mesh.triangles].all(axis=1)
+        triangles = mesh.triangles[complete]
         normals = vertex_normals(np.where(np.isfinite(vertices), vertices, 0.0), triangles)
         corners = vertices[triangles]
         shapes = {"corners": corners, "normals": normals[triangles]}

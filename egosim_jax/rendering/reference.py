@@ -9,7 +9,7 @@ pixel shows the shape that its ray meets first, without shading.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import reduce
 
@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from egosim_jax.geometry import invert, pixel_rays, project, transform
-from egosim_jax.rendering.mesh_reference import draw_mesh as draw_mesh
+from egosim_jax.rendering.mesh import AMBIENT, DIFFUSE, MovingMesh, vertex_normals
 from egosim_jax.rendering.skeleton import (
     BONE_RADIUS_M,
     FAR_M,
@@ -26,6 +26,7 @@ from egosim_jax.rendering.skeleton import (
     NEAR_M,
     SKELETONS,
 )
+from egosim_jax.runtime.open3d import load_open3d
 from egosim_jax.types import Cameras, InputError, Kind, Motion, SceneState, View
 
 Paths = Sequence[tuple[Bool[np.ndarray, " n"], Float[np.ndarray, "f 4 4"]]]
@@ -270,3 +271,98 @@ def _meet(
         place = (t[..., None] * rays - start) @ axis
     hit = (t >= NEAR_M) & (place >= 0) & (place <= length)
     return np.where(hit, t, np.inf)
+
+
+def draw_mesh(
+    mesh: MovingMesh, cameras: Cameras
+) -> tuple[UInt8[np.ndarray, "f h w 3"], Float32[np.ndarray, "f h w"]]:
+    """Draw a mesh; return the image and its depth, black and infinite off the mesh.
+
+    Triangles with a non-finite vertex are missing. Nothing nearer than 1 cm is drawn.
+    """
+    shape = len(mesh.vertices_m), cameras.height, cameras.width
+    image, depth = np.zeros((*shape, 3), np.uint8), np.full(shape, np.inf, np.float32)
+    rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
+    for frame, pose in enumerate(cameras.world_from_camera):
+        vertices = transform(invert(pose), mesh.vertices_m[frame])
+        complete = np.isfinite(vertices).all(axis=1)[mesh.triangles].all(axis=1)
+        if complete.any():
+            _draw_triangles(image[frame], depth[frame], vertices, mesh, complete, rays)
+    return image, depth
+
+
+def draw_scene(
+    vertices_m: Float[np.ndarray, "v 3"],
+    triangles: Int[np.ndarray, "t 3"],
+    colors: UInt8[np.ndarray, "v 3"],
+    cameras: Cameras,
+) -> tuple[UInt8[np.ndarray, "f h w 3"], UInt8[np.ndarray, "f h w"]]:
+    """Draw a scene in the colors of its vertices, without light, along a camera path.
+
+    Returns the image and the mask: 255, and black, where no triangle is seen. Raises `InputError`
+    if the first frame shows none.
+    """
+    cast = _ray_caster(vertices_m, triangles)
+    shape = len(cameras.world_from_camera), cameras.height, cameras.width
+    image, mask = np.zeros((*shape, 3), np.uint8), np.full(shape, 255, np.uint8)
+    rays = pixel_rays(cameras.intrinsics_px, height=cameras.height, width=cameras.width)
+    for frame, pose in enumerate(cameras.world_from_camera):
+        ways = rays @ pose[:3, :3].T
+        _, seen, numbers, share = cast(pose[:3, 3] + NEAR_M * ways, ways)
+        image[frame][seen] = np.rint(np.einsum("nk,nkc->nc", share, colors[triangles[numbers]]))
+        mask[frame][seen] = 0
+    if mask[0].all():
+        raise InputError(
+            f"None of the {len(triangles)} triangles of the scene is visible in the first frame: "
+            "the camera must look at the scene, in the same world coordinates."
+        )
+    return image, mask
+
+
+def _ray_caster(
+    vertices_m: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"], *, threads: int = 0
+) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]:
+    """Return a function of the starts and directions of rays, by Open3D.
+
+    It returns their distances, which rays meet a triangle, and its number and the barycentric
+    coordinates there. All cores cast the rays, or the number of `threads`.
+    """
+    o3d = load_open3d()
+
+    scene = o3d.t.geometry.RaycastingScene(nthreads=threads)
+    scene.add_triangles(
+        o3d.core.Tensor(vertices_m.astype(np.float32)), o3d.core.Tensor(triangles.astype(np.uint32))
+    )
+
+    def cast(starts: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
+        rays = np.concatenate([starts, directions], axis=-1).astype(np.float32)
+        hits = scene.cast_rays(o3d.core.Tensor(rays), nthreads=threads)
+        distances = hits["t_hit"].numpy()
+        seen = np.isfinite(distances)
+        u, v = hits["primitive_uvs"].numpy()[seen].T
+        return distances, seen, hits["primitive_ids"].numpy()[seen], np.stack([1 - u - v, u, v], 1)
+
+    return cast
+
+
+def _draw_triangles(
+    image: UInt8[np.ndarray, "h w 3"],
+    depth: Float32[np.ndarray, "h w"],
+    vertices: Float[np.ndarray, "v 3"],
+    mesh: MovingMesh,
+    complete: np.ndarray,
+    rays: Float[np.ndarray, "h w 3"],
+) -> None:
+    """Draw the given triangles of one frame, in camera coordinates."""
+    triangles = mesh.triangles[complete]
+    cast = _ray_caster(np.nan_to_num(vertices), triangles, threads=1)
+    distance, seen, numbers, share = cast(NEAR_M * rays, rays)
+    corners = triangles[numbers]
+    normals = vertex_normals(np.where(np.isfinite(vertices), vertices, 0.0), triangles)
+    normal, color = (np.einsum("nk,nkc->nc", share, x[corners]) for x in (normals, mesh.colors))
+    depth[seen] = distance[seen] + np.float32(NEAR_M)
+    towards = -rays[seen]
+    size = np.linalg.norm(normal, axis=1) * np.linalg.norm(towards, axis=1)
+    cosine = (normal * towards).sum(axis=1) / np.maximum(size, 1e-12)
+    light = AMBIENT + DIFFUSE * np.maximum(cosine, 0)
+    image[seen] = np.round(255 * np.clip(color * light[:, None], 0, 1))

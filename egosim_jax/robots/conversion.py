@@ -27,7 +27,7 @@ from egosim_jax.robots.sources import Source
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.simulation.start import Start
 from egosim_jax.state.planes import vertical
-from egosim_jax.types import Action, Cameras, InputError, SceneState, Triplet, near_view
+from egosim_jax.types import Action, InputError, SceneState, Triplet, seen_hands
 
 Hands = Literal["acting", "all"]
 """Hands that get a robot: the one that moves most, or every one; all hands are removed."""
@@ -296,10 +296,10 @@ def triplets_of(
     `name` begins the ids of the clips. `point_px` and `prior` are the model's.
     """
     source = conversion.source
-    for clip, (state, given) in enumerate(zip(source.states, source.episode.actions, strict=True)):
-        action = _skeletons(conversion, clip, given)
+    for clip, (state, human) in enumerate(zip(source.states, source.episode.actions, strict=True)):
+        action = _skeletons(conversion, clip, human)
         fps = source.episode.fps
-        motion = predict(state, given, fps=fps) if prior == "predicted" else None
+        motion = predict(state, human, fps=fps) if prior == "predicted" else None
         view = renderer.render(state, action.cameras, point_px=point_px, motion=motion)
         hands, _ = renderer.draw_hands(action.joints_m, action.cameras, kind="robot")
         yield Triplet(
@@ -342,13 +342,7 @@ def _skeletons(conversion: Conversion, clip: int, action: Action) -> Action:
     joints = np.stack(hands, axis=1)
     return Action(
         cameras=action.cameras,
-        joints_m=_in_view(action.cameras, joints),
+        joints_m=seen_hands(action.cameras, joints),
         kind="robot",
         prompt=action.prompt,
     )
-
-
-def _in_view(cameras: Cameras, joints: np.ndarray) -> np.ndarray:
-    """Return the joints without hands that no camera of the clip sees."""
-    seen = np.asarray(near_view(cameras, joints).any(axis=0))[:, None, None]
-    return np.where(seen, joints, np.nan)

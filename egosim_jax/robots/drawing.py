@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from egosim_jax.geometry import invert, pixel_rays, project, transform, upsample_intrinsics
+from egosim_jax.robots.ik import posed
 from egosim_jax.robots.models import TABLE, RobotModel
 from egosim_jax.types import Cameras
 from egosim_jax.worlds.tabletop.embree import Mesh, Rays, make_mesh
@@ -69,13 +70,7 @@ class Shape:
 
     def pose(self, q: np.ndarray, opening_m: float, world_from_base: np.ndarray) -> list[Mesh]:
         """Return the meshes in the world for a posture."""
-        mujoco: Any = import_module("mujoco")
-
-        mj = self.robot.mj
-        data = mujoco.MjData(mj)
-        data.qpos[:] = self.robot.open(q, opening_m)
-        mujoco.mj_kinematics(mj, data)
-        placed = []
+        data, placed = posed(self.robot, self.robot.open(q, opening_m)), []
         for n, (vertices, triangles), _ in self.geoms:
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = data.geom_xmat[n].reshape(3, 3), data.geom_xpos[n]

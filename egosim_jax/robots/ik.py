@@ -124,11 +124,9 @@ class Solver:
         mujoco: Any = import_module("mujoco")
 
         mj, grips, clearances, apart = self.robot.mj, [], [], []
-        data, ends = mujoco.MjData(mj), np.zeros(6)
-        table = mj.geom(TABLE).id
+        ends, table = np.zeros(6), mj.geom(TABLE).id
         for posture, opening in zip(q, openings, strict=True):
-            data.qpos[:] = self.robot.open(posture, float(opening))
-            mujoco.mj_kinematics(mj, data)
+            data = posed(self.robot, self.robot.open(posture, float(opening)))
             grips.append(grip_of(self.robot, data))
             gaps = [mujoco.mj_geomDistance(mj, data, table, n, 1.0, ends) for n in self.links]
             clearances.append(min(gaps))
@@ -179,6 +177,16 @@ class Solver:
         return configuration.q.copy()
 
 
+def posed(robot: RobotModel, q: Float[np.ndarray, " q"]) -> Any:
+    """Return MuJoCo's data with the bodies of a robot at the positions of its joints."""
+    mujoco: Any = import_module("mujoco")
+
+    data = mujoco.MjData(robot.mj)
+    data.qpos[:] = q
+    mujoco.mj_kinematics(robot.mj, data)
+    return data
+
+
 def _table_limit(robot: RobotModel, links: list[int]) -> Any:
     """Return the limit of mink that keeps geometries above the table, and lifts those below it.
 
@@ -226,10 +234,7 @@ def _apart(robot: RobotModel, links: list[int]) -> list[tuple[list[int], list[in
     """
     mujoco: Any = import_module("mujoco")
 
-    mj = robot.mj
-    data, ends = mujoco.MjData(mj), np.zeros(6)
-    data.qpos[:] = robot.home
-    mujoco.mj_kinematics(mj, data)
+    mj, data, ends = robot.mj, posed(robot, robot.home), np.zeros(6)
     gripper_body = mj.body_weldid[mj.site_bodyid[robot.site]]
     tail = [n for n in links if _is_under(mj, int(mj.geom_bodyid[n]), int(gripper_body))]
     solid = [n for n in range(mj.ngeom) if mj.geom_contype[n] or mj.geom_conaffinity[n]]

@@ -10,8 +10,8 @@ from typing import Any, no_type_check
 import numpy as np
 from jaxtyping import Bool, Float
 
-from egosim_jax.geometry import invert, pixel_rays, transform
-from egosim_jax.robots.ik import REACHED_M, Solver, Track
+from egosim_jax.geometry import invert, pixel_rays, rotation_z, transform
+from egosim_jax.robots.ik import REACHED_M, Solver, Track, posed
 from egosim_jax.robots.models import TABLE, RobotModel, grip_of
 from egosim_jax.robots.retarget import Grips
 from egosim_jax.types import Cameras
@@ -110,15 +110,11 @@ def place(
 
 def _clear(solver: Solver, track: Track, cameras: np.ndarray) -> Bool[np.ndarray, " f"]:
     """Return in which frames no link is within `EYE_M` of the camera, in nine directions ahead."""
-    mujoco: Any = import_module("mujoco")
-
-    mj, clear = solver.robot.mj, []
-    data = mujoco.MjData(mj)
     rays = np.array([(*across, 1.0) for across in product((-1.0, 0.0, 1.0), repeat=2)])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    clear = []
     for q, opening, camera in zip(track.q, track.opening_m, cameras, strict=True):
-        data.qpos[:] = solver.robot.open(q, float(opening))
-        mujoco.mj_kinematics(mj, data)
+        data = posed(solver.robot, solver.robot.open(q, float(opening)))
         clear.append(not _meets(solver, data, camera, rays, EYE_M).any())
     return np.array(clear)
 
@@ -132,18 +128,14 @@ def _try(
     and `BAD` for each moment that is not reached, and for each in which the arm is close in front
     of the camera or hides the gripper from it.
     """
-    mujoco: Any = import_module("mujoco")
-
-    robot, mj = solver.robot, solver.robot.mj
-    data = mujoco.MjData(mj)
+    robot = solver.robot
     q = start = robot.home
     cost = 0.0
     for number, (pose, opening, camera) in enumerate(zip(path, openings, cameras, strict=True)):
         opening = float(np.clip(opening, robot.openings_m[0], robot.openings_m[-1]))
         q = solver.approach(q, pose, opening, steps=NEXT_STEPS if number else FIRST_STEPS)
         start = q if number == 0 else start
-        data.qpos[:] = robot.open(q, opening)
-        mujoco.mj_kinematics(mj, data)
+        data = posed(robot, robot.open(q, opening))
         grip = grip_of(robot, data)
         miss = bool(np.linalg.norm(grip[:3, 3] - pose[:3, 3]) > REACHED_M)
         turn = np.arccos(np.clip((np.sum(grip[:3, :3] * pose[:3, :3]) - 1) / 2, -1, 1))
@@ -215,17 +207,11 @@ def _candidates(
 
 def _facing(robot: RobotModel) -> float:
     """Return the direction of the gripper at home, as an angle about z."""
-    mujoco: Any = import_module("mujoco")
-
-    data = mujoco.MjData(robot.mj)
-    data.qpos[:] = robot.home
-    mujoco.mj_kinematics(robot.mj, data)
-    x, y, _ = grip_of(robot, data)[:3, 3]
+    x, y, _ = grip_of(robot, posed(robot, robot.home))[:3, 3]
     return float(np.arctan2(y, x))
 
 
 def _base(place: tuple[float, float, float], yaw: float) -> Float[np.ndarray, "4 4"]:
     pose = np.eye(4)
-    pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    pose[:3, 3] = place
+    pose[:3, :3], pose[:3, 3] = rotation_z(yaw), place
     return pose

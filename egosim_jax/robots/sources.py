@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, no_type_check
 
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import UInt8
 
 from egosim_jax.annotate.clip import ANNOTATION, MASKS, read_masks
 from egosim_jax.annotate.to_episode import episode_from
@@ -120,7 +120,13 @@ def _annotated(path: Path) -> Source:
     frames = episode.ground_truth[0].frames
     masks = read_masks(path / MASKS, frames.shape[:3])
     config = ClassicalConfig()
-    stages = (take_action, _KnownHands(masks), config.motion, config.moved, config.new)
+
+    def mark_hands(
+        clip: Clip, action: Action, state: SceneState, so_far: Observation
+    ) -> Observation:
+        return replace(so_far, object_ids=np.where(masks, -1, 0).astype(np.int32))
+
+    stages = (take_action, mark_hands, config.motion, config.moved, config.new)
     return _perceived(
         "annotated clip", episode, [episode.state], [frames], [Pipeline(stages=stages)], info.fps
     )
@@ -129,18 +135,18 @@ def _annotated(path: Path) -> Source:
 def _simulated(path: Path) -> Source:
     """Return a run of `egosim simulate`: its episode, with the generated clips as frames."""
     written = read_json(path / CONFIG)
-    given = written.get("simulate") if isinstance(written, dict) else None
-    if not isinstance(given, dict):
+    settings = written.get("simulate") if isinstance(written, dict) else None
+    if not isinstance(settings, dict):
         raise InputError(
             f"{quote_path(path)} is not a run of egosim simulate: give {KINDS}. (SOURCE)"
         )
     done = Journal(path).done
-    episode = _episode_of(given, done)
+    episode = _episode_of(settings, done)
     clips = [path / f"clip_{n}" for n in range(1, len(episode.actions) + 1)]
     return _generated("simulation", episode, episode.state, clips)
 
 
-def _episode_of(given: dict[str, Any], done: dict[str, dict[str, Any]]) -> Episode:
+def _episode_of(settings: dict[str, Any], done: dict[str, dict[str, Any]]) -> Episode:
     """Return the episode of a run. Raises `InputError` if it is another one than the recorded."""
     from egosim_jax import configs
     from egosim_jax.worlds.tabletop import make_sequence, to_episode
@@ -148,13 +154,13 @@ def _episode_of(given: dict[str, Any], done: dict[str, dict[str, Any]]) -> Episo
     count = sum(name.endswith(" generate") for name in done)
     if not count:
         raise InputError("The run has no finished clip: run its command again first. (SOURCE)")
-    if given.get("episode") is None:
-        video = configs.get(str(given["config"])).video
-        kind = "robot" if given.get("robot") else "human"
-        clips = make_sequence(int(given["seed"]), spec=video, clips=count, kind=kind)
+    if settings.get("episode") is None:
+        video = configs.get(str(settings["config"])).video
+        kind = "robot" if settings.get("robot") else "human"
+        clips = make_sequence(int(settings["seed"]), spec=video, clips=count, kind=kind)
         episode = to_episode(list(clips), fps=video.fps)
     else:
-        episode = Episode.load(Path(given["episode"]))
+        episode = Episode.load(Path(settings["episode"]))
     actions = episode.actions[:count]
     same = [
         done.get(f"{n} action", {}).get("made_of") == {"action": fingerprint(action)}
@@ -163,7 +169,7 @@ def _episode_of(given: dict[str, Any], done: dict[str, dict[str, Any]]) -> Episo
     recorded = done.get("run", {}).get("made_of", {}).get("state")
     if recorded != snapshot.fingerprint(episode.state) or not all(same) or len(same) < count:
         raise InputError(
-            f"The episode of the run, {quote_text(str(given.get('episode') or 'tabletop'))}, is "
+            f"The episode of the run, {quote_text(str(settings.get('episode') or 'tabletop'))}, is "
             "not the one that the run was made from: restore it. (SOURCE)"
         )
     return replace(episode, actions=actions, ground_truth=())
@@ -191,7 +197,8 @@ def _generated(kind: str, episode: Episode, state: SceneState, clips: Sequence[P
     for clip in clips:
         frames.append(load_clip(clip / "frames.npz", episode.fps).frames)
         kept = clip / "perceived.npz"
-        found.append(_Recorded(archive.load(kept)) if kept.exists() else ClassicalConfig().build())
+        recorded = archive.load(kept) if kept.exists() else None
+        found.append(_recorded(recorded) if recorded else ClassicalConfig().build())
         states.append(snapshot.load(clip / "state") if (clip / "state").exists() else states[-1])
     return _perceived(kind, episode, states[: len(clips)], frames, found)
 
@@ -229,24 +236,6 @@ def _perceived(
     )
 
 
-@no_type_check
-@dataclass(frozen=True)
-class _KnownHands:
-    """Stage that sets `object_ids` to the pixels of hands and arms that an annotation has."""
-
-    hands: Bool[np.ndarray, "f h w"]
-
-    def __call__(
-        self, clip: Clip, action: Action, state: SceneState, so_far: Observation
-    ) -> Observation:
-        return replace(so_far, object_ids=np.where(self.hands, -1, 0).astype(np.int32))
-
-
-@dataclass(frozen=True)
-class _Recorded:
-    """Perception of a clip that a run kept."""
-
-    perceived: Perceived
-
-    def __call__(self, clip: Clip, action: Action, state: SceneState) -> Perceived:
-        return self.perceived
+def _recorded(perceived: Perceived) -> Perception:
+    """Return the perception of a clip that a run kept."""
+    return lambda clip, action, state: perceived

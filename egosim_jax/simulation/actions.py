@@ -22,7 +22,7 @@ from egosim_jax.types import (
     InputError,
     Kind,
     SceneState,
-    near_view,
+    seen_hands,
 )
 
 MAX_SPEED_M_S = 20.0
@@ -233,9 +233,8 @@ def with_places(action: Action, placed_m: Float[np.ndarray, "f n j 3"]) -> Place
 def slice_action(action: Action, start: int, end: int | None) -> Action:
     """Return the action of some frames; a hand that is out of view in all of them is missing."""
     poses = action.cameras.world_from_camera[start:end]
-    cameras, joints = replace(action.cameras, world_from_camera=poses), action.joints_m[start:end]
-    lost = np.logical_not(near_view(cameras, joints).any(axis=0))
-    joints = np.where(lost[None, :, None, None], np.nan, joints)
+    cameras = replace(action.cameras, world_from_camera=poses)
+    joints = seen_hands(cameras, action.joints_m[start:end])
     piece = Action(cameras=cameras, joints_m=joints, kind=action.kind, prompt=action.prompt)
     if isinstance(action, PlacedAction):
         return with_places(piece, action.placed_m[start:end])

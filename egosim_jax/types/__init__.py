@@ -24,7 +24,7 @@ is kept.
 
 from __future__ import annotations
 
-from egosim_jax.types.cameras import FOCAL_WIDTHS, MAX_SKEW, Cameras, is_rigid
+from egosim_jax.types.cameras import FOCAL_WIDTHS, MAX_SKEW, Cameras, check_rigid, is_rigid
 from egosim_jax.types.data import (
     HAND_SIZE_M,
     JOINTS,
@@ -38,8 +38,10 @@ from egosim_jax.types.data import (
     SceneState,
     Triplet,
     View,
+    check_hands,
     near_view,
     object_name,
+    seen_hands,
 )
 from egosim_jax.types.motion import Cause, How, Motion, ObjectPath
 from egosim_jax.types.settings import (
@@ -83,9 +85,12 @@ __all__ = [
     "VideoSpec",
     "View",
     "check_counts",
+    "check_hands",
+    "check_rigid",
     "check_seed",
     "check_video",
     "is_rigid",
     "near_view",
     "object_name",
+    "seen_hands",
 ]

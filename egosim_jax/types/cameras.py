@@ -46,24 +46,17 @@ class Cameras(Shown):
                     f"{name} is {dtype or type(value).__name__} {have}: it must be an array of "
                     "numbers, with at least one frame of poses."
                 )
-        rigid = is_rigid(self.world_from_camera)
-        if not rigid.all():
-            frame = int(np.argmin(rigid))
-            raise InputError(
-                f"Camera pose at frame {frame} is not a rigid transform: it must be finite, with "
-                "a rotation of determinant 1 and the last row 0 0 0 1, not "
-                f"{self.world_from_camera[frame].tolist()}."
-            )
+        check_rigid(self.world_from_camera)
         self._check_intrinsics()
 
     def _check_intrinsics(self) -> None:
         (fx, skew, cx), (_, fy, cy), _ = matrix = np.asarray(self.intrinsics_px, float)
         sizes = self.height, self.width
-        given = f"intrinsics_px {matrix.tolist()}, width {self.width}, height {self.height}"
+        written = f"intrinsics_px {matrix.tolist()}, width {self.width}, height {self.height}"
         integers = all(hasattr(size, "__index__") for size in sizes)
         if not (integers and np.isfinite(matrix).all() and min(fx, fy, *sizes) > 0):
             raise InputError(
-                f"Cameras have invalid intrinsics or image size: {given}. All must be finite, "
+                f"Cameras have invalid intrinsics or image size: {written}. All must be finite, "
                 "focal lengths positive, sizes positive whole numbers."
             )
         low, high = FOCAL_WIDTHS[0] * self.width, FOCAL_WIDTHS[1] * self.width
@@ -72,11 +65,23 @@ class Cameras(Shown):
         plausible &= -0.5 <= cx <= self.width - 0.5 and -0.5 <= cy <= self.height - 0.5
         if not plausible:
             raise InputError(
-                f"Cameras have implausible intrinsics: {given}. They must be [fx, skew, cx], "
+                f"Cameras have implausible intrinsics: {written}. They must be [fx, skew, cx], "
                 f"[0, fy, cy], [0, 0, 1] in pixels of this size: focal lengths from {low:g} to "
                 f"{high:g}, the principal point inside the image. Do not transpose or normalize "
                 "them, and scale them to the clip's size."
             )
+
+
+def check_rigid(world_from_camera: Float[np.ndarray, "f 4 4"]) -> None:
+    """Raise `InputError` at the first camera pose that is not a rigid transform."""
+    rigid = is_rigid(world_from_camera)
+    if not rigid.all():
+        frame = int(np.argmin(rigid))
+        raise InputError(
+            f"Camera pose at frame {frame} is not a rigid transform: it must be finite, with a "
+            "rotation of determinant 1 and the last row 0 0 0 1, not "
+            f"{world_from_camera[frame].tolist()}."
+        )
 
 
 def is_rigid(poses: Float[np.ndarray, "f 4 4"]) -> Bool[np.ndarray, " f"]:

@@ -95,16 +95,59 @@ REACH_M = 3.0
 def near_view(cameras: Cameras, joints_m: Float[np.ndarray, "f n j 3"]) -> Bool[np.ndarray, "f n"]:
     """Return which hands have a joint within reach of the camera and in or near its image."""
     poses = cameras.world_from_camera
-    given = np.asarray(np.isfinite(joints_m).all(axis=(2, 3)))
-    where = np.where(given[:, :, None, None], joints_m, 0.0) - poses[:, None, None, :3, 3]
+    present = np.asarray(np.isfinite(joints_m).all(axis=(2, 3)))
+    where = np.where(present[:, :, None, None], joints_m, 0.0) - poses[:, None, None, :3, 3]
     x, y, z = np.moveaxis(np.einsum("fnjc,fcd->fnjd", where, poses[:, :3, :3]), -1, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         u = cameras.intrinsics_px[0, 0] * x / z + cameras.intrinsics_px[0, 2]
         v = cameras.intrinsics_px[1, 1] * y / z + cameras.intrinsics_px[1, 2]
     near_u, near_v = NEAR_IMAGE * cameras.width, NEAR_IMAGE * cameras.height
     seen = (z > 0) & (z < REACH_M) & (u > -near_u) & (u < cameras.width + near_u)
-    seen &= (v > -near_v) & (v < cameras.height + near_v) & given[..., None]
+    seen &= (v > -near_v) & (v < cameras.height + near_v) & present[..., None]
     return np.asarray(seen.any(axis=2))
+
+
+def seen_hands(
+    cameras: Cameras, joints_m: Float[np.ndarray, "f n j 3"]
+) -> Float[np.ndarray, "f n j 3"]:
+    """Return the joints with NaN for hands that are never near the view (`near_view`)."""
+    seen = np.asarray(near_view(cameras, joints_m).any(axis=0))[:, None, None]
+    return joints_m if seen.all() else np.where(seen, joints_m, np.nan)
+
+
+@no_type_check
+def check_hands(
+    joints_m: Float[np.ndarray, "f n j 3"], kind: Kind, frames: int
+) -> Bool[np.ndarray, "f n"]:
+    """Return which hands are given; raise `InputError` if joints are not of such hands."""
+    if kind not in JOINTS:
+        raise InputError(f"The kind of hands must be 'human' or 'robot', not {str(kind)[:40]!r}.")
+    joints, wanted = np.asarray(joints_m), JOINTS[kind]
+    shape = (frames, max(1, joints.shape[1] if joints.ndim == 4 else 1), wanted, 3)
+    if joints.shape != shape or joints.dtype.kind != "f":
+        raise InputError(
+            f"joints_m is {joints.dtype} {joints.shape}: {kind} hands of a path of {frames} "
+            f"cameras must be floats ({frames}, hands, {wanted}, 3), at least one hand. A missing "
+            "hand has joints of NaN."
+        )
+    present = np.asarray(np.isfinite(joints).all(axis=(2, 3)))
+    broken = ~present & ~np.isnan(joints).all(axis=(2, 3))
+    if broken.any():
+        frame, hand = np.argwhere(broken)[0].tolist()
+        raise InputError(
+            f"Hand {hand} of frame {frame} is only partly finite: give all joints of a hand, or "
+            "NaN for all where it is missing."
+        )
+    extent = np.linalg.norm(np.ptp(joints, axis=2), axis=-1)
+    low, high = HAND_SIZE_M
+    bad = present & ~((extent >= low) & (extent <= high))
+    if bad.any():
+        frame, hand = np.argwhere(bad)[0].tolist()
+        raise InputError(
+            f"Hand {hand} of frame {frame} is {extent[frame, hand]:.4g} m large: a hand has {low} "
+            f"to {high} m. Joints must be in meters."
+        )
+    return present
 
 
 @no_type_check
@@ -130,53 +173,19 @@ class Action(Shown):
         Raises `InputError`, also if a hand never comes near any camera's view: then it is not in
         world coordinates.
         """
-        if self.kind not in JOINTS:
-            raise InputError(
-                f"The kind of hands must be 'human' or 'robot', not {str(self.kind)[:40]!r}."
-            )
+        present = check_hands(self.joints_m, self.kind, len(self.cameras.world_from_camera))
         if not isinstance(self.prompt, str):
             raise InputError(f"The prompt must be text, not {type(self.prompt).__name__}.")
-        joints = np.asarray(self.joints_m)
-        frames, wanted = len(self.cameras.world_from_camera), JOINTS[self.kind]
-        shape = (frames, max(1, joints.shape[1] if joints.ndim == 4 else 1), wanted, 3)
-        if joints.shape != shape or joints.dtype.kind != "f":
-            raise InputError(
-                f"joints_m is {joints.dtype} {joints.shape}: {self.kind} hands of a path of "
-                f"{frames} cameras must be floats ({frames}, hands, {wanted}, 3), at least one "
-                "hand. A missing hand has joints of NaN."
-            )
-        finite = np.isfinite(joints)
-        given = np.asarray(finite.all(axis=(2, 3)))
-        broken = ~given & ~np.isnan(joints).all(axis=(2, 3))
-        if broken.any():
-            frame, hand = np.argwhere(broken)[0].tolist()
-            raise InputError(
-                f"Hand {hand} of frame {frame} is only partly finite: give all joints of a hand, "
-                "or NaN for all where it is missing."
-            )
-        if given.any():
-            self._check_size(joints, given)
-            self._check_place(joints, given)
+        if present.any():
+            self._check_place(self.joints_m, present)
 
-    def _check_size(self, joints: np.ndarray, given: np.ndarray) -> None:
-        hands = joints[given]
-        extent = np.linalg.norm(hands.max(axis=1) - hands.min(axis=1), axis=-1)
-        low, high = HAND_SIZE_M
-        bad = (extent < low) | (extent > high)
-        if bad.any():
-            frame, hand = np.argwhere(given)[np.argmax(bad)].tolist()
-            raise InputError(
-                f"Hand {hand} of frame {frame} is {extent[np.argmax(bad)]:.4g} m large: a hand has "
-                f"{low} to {high} m. Joints must be in meters."
-            )
-
-    def _check_place(self, joints: np.ndarray, given: np.ndarray) -> None:
+    def _check_place(self, joints: np.ndarray, present: np.ndarray) -> None:
         """Raise `InputError` if no joint of a hand is within reach of a camera and near its image.
 
         Each hand that is given in any frame is checked separately.
         """
         seen = near_view(self.cameras, joints)
-        lost = given.any(axis=0) & ~seen.any(axis=0)
+        lost = present.any(axis=0) & ~seen.any(axis=0)
         if lost.any():
             raise InputError(
                 f"No joint of hand {int(np.argmax(lost))} comes near the view of the cameras, at "

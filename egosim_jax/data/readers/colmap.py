@@ -22,13 +22,12 @@ import tyro
 from egosim_jax.data.readers import Entry, inside, make_id, make_rate, natural_order, require
 from egosim_jax.data.readers.images import (
     MAX_IMAGES,
-    ImageVideo,
     describe_run,
     longest_run,
     read_posed,
     write_images,
 )
-from egosim_jax.data.readers.lenses import MAX_SPREAD, Lens
+from egosim_jax.data.readers.lenses import MAX_SPREAD, Lens, Remap
 from egosim_jax.data.recording import Recording
 from egosim_jax.data.scene_points import ScenePoints
 from egosim_jax.geometry import invert
@@ -95,20 +94,16 @@ class Colmap:
             )
         paths = [inside(root, image.name, what="an image of the model") for image in images]
         lens = one_lens([model.cameras[image.camera_id] for image in images])
-        video = write_images(folder, (read_posed(path, lens) for path in paths), lens, fps)
-        return Recording(
-            recording_id=make_id([self.source.resolve().name]),
-            video=video.path,
-            frames=video.frames,
-            fps=fps,
-            height=video.height,
-            width=video.width,
+        pixels = (read_posed(path, lens) for path in paths)
+        recording, remap = write_images(folder, pixels, lens, fps)
+        return replace(
+            recording,
             world_from_camera=invert(np.stack([image.camera_from_world for image in images])),
-            intrinsics_px=video.intrinsics_px,
-            points=_points(model, images, video),
+            intrinsics_px=(remap or lens).intrinsics_px,
+            points=_points(model, images, remap),
             provenance={
                 "images": f"{len(images)} of {len(names)}, {len(by_name)} registered",
-                "lens": "pinhole" if video.remap is None else "remapped",
+                "lens": "pinhole" if remap is None else "remapped",
                 **describe_run(names, run),
             },
         )
@@ -155,13 +150,13 @@ def make_lens(camera: Camera) -> Lens:
     )
 
 
-def _points(model: Model, images: list[Image], video: ImageVideo) -> ScenePoints | None:
+def _points(model: Model, images: list[Image], remap: Remap | None) -> ScenePoints | None:
     """Return the model's points with the pixels that observe them."""
     if not len(model.points):
         return None
     frames, indices, pixels = [], [], []
     for frame, image in enumerate(images):
-        moved = image.pixels_px if video.remap is None else video.remap.move(image.pixels_px)
+        moved = image.pixels_px if remap is None else remap.move(image.pixels_px)
         good = np.isfinite(moved).all(axis=1)
         pixels.append(moved[good])
         indices.append(image.observed[good])

@@ -32,12 +32,12 @@ from jaxtyping import Float
 
 from egosim_jax.data.pairing import pair_rows
 from egosim_jax.data.readers import Entry, find_files, make_id, require
-from egosim_jax.data.readers.hands import clean_joints
+from egosim_jax.data.readers.hands import with_joints
 from egosim_jax.data.recording import Recording
 from egosim_jax.io.bounded import listing, quote_path
 from egosim_jax.io.untrusted.hdf5 import read_hdf5
 from egosim_jax.io.video import probe_video
-from egosim_jax.types import Cameras, InputError
+from egosim_jax.types import InputError
 
 logger = logging.getLogger(__name__)
 
@@ -98,29 +98,17 @@ class EgoDex:
                 quote_path(path), listing(unknown),
             )  # fmt: skip
         caption, objects = _texts(file.texts)
-        poses, joints = poses[rows], None if joints is None else joints[rows]
-        cameras = None if intrinsics is None else Cameras(
-            world_from_camera=poses,
-            intrinsics_px=intrinsics,
-            height=info.height,
-            width=info.width,
-        )  # fmt: skip
-        joints, notes = clean_joints(joints, cameras)
-        return Recording(
-            recording_id=make_id([path.stem]),
-            video=video,
+        recording = Recording.of_video(
+            video,
+            info,
             frames=len(rows),
-            fps=info.fps,
-            height=info.height,
-            width=info.width,
-            world_from_camera=poses,
+            world_from_camera=poses[rows],
             intrinsics_px=intrinsics,
             metric=True,
-            joints_m=joints,
             caption=caption or None,
             names=objects,
-            provenance=notes,
         )
+        return with_joints(recording, None if joints is None else joints[rows])
 
     def _joints(
         self, arrays: Mapping[str, np.ndarray], names: list[str]
@@ -129,12 +117,12 @@ class EgoDex:
         if not any(f"transforms/{name}" in arrays for name in names):
             return None, []
         frames = len(arrays["transforms/camera"])
-        given = {name: array for name, array in arrays.items() if len(array) == frames}
-        unknown = [path for name in names if (path := f"transforms/{name}") not in given]
+        complete = {name: array for name, array in arrays.items() if len(array) == frames}
+        unknown = [path for name in names if (path := f"transforms/{name}") not in complete]
         nowhere, certain = np.full((frames, 4, 4), np.nan), np.ones(frames)
-        moved = [given.get(f"transforms/{name}", nowhere)[:, :3, 3] for name in names]
+        moved = [complete.get(f"transforms/{name}", nowhere)[:, :3, 3] for name in names]
         joints = rearrange(np.stack(moved, axis=1), "f (n j) c -> f n j c", n=2)
-        confidences = [given.get(f"confidences/{name}", certain) for name in names]
+        confidences = [complete.get(f"confidences/{name}", certain) for name in names]
         confidence = rearrange(np.stack(confidences), "(n j) f -> f n j", n=2)
         joints[np.median(confidence, axis=2) < self.min_confidence] = np.nan
         return joints, unknown

@@ -29,13 +29,13 @@ from egosim_jax.data.pairing import pair_rows
 from egosim_jax.data.readers import Entry, check_one_camera, make_id, natural_order, numbered
 from egosim_jax.data.readers.egovid import read_matrices
 from egosim_jax.data.readers.hamer import read_hamer
-from egosim_jax.data.readers.hands import clean_joints
+from egosim_jax.data.readers.hands import with_joints
 from egosim_jax.data.recorded_files import DepthFiles
 from egosim_jax.data.recording import Recording
 from egosim_jax.geometry import invert
 from egosim_jax.io.bounded import quote_path, read_bytes
 from egosim_jax.io.video import VideoInfo, probe_video
-from egosim_jax.types import Cameras, InputError
+from egosim_jax.types import InputError
 
 logger = logging.getLogger(__name__)
 
@@ -86,37 +86,30 @@ def _read(clip: Path, folder: Path) -> Recording:
     poses = invert(np.stack([read_matrices(path, (4, 4)) for path in paths]))
     lenses = [path.with_name(path.name.replace("extrinsics", "intrinsics")) for path in paths]
     cameras = [read_matrices(path, (3, 3)) for path in lenses if path.exists()]
-    joints, counts, intrinsics = None, dict[str, str](), None
+    notes, intrinsics = {"scale": "estimated by Depth Anything 3"}, None
     if cameras:
         intrinsics = np.median(cameras, axis=0)
         focal_px = np.stack(cameras)[:, 0, 0]
         drift = check_one_camera(focal_px, quote_path(poses_folder), most=MAX_DRIFT)
-        counts["focal_drift"] = f"{drift:.4f}"
+        notes["focal_drift"] = f"{drift:.4f}"
     else:
         logger.warning("%s: intrinsics and hands stay unknown", quote_path(lenses[0]))
-    hands = sorted((clip / "_proc" / "mano_full").rglob("*.json"))
-    if hands and intrinsics is not None:
-        seen = Cameras(world_from_camera=poses, intrinsics_px=intrinsics, height=info.height,
-                       width=info.width)  # fmt: skip
-        paired = replace(seen, world_from_camera=poses[rows])
-        joints, odd = clean_joints(read_hamer(hands[0], seen, info)[rows], paired)
-        counts |= odd
     depth = poses_folder / "depth_000000.npy"
     files = (depth if depth.exists() else None, *[None] * (len(rows) - 1))
-    return replace(
+    recording = replace(
         _of_video(clip, video, info),
         frames=len(rows),
         world_from_camera=poses[rows],
         intrinsics_px=intrinsics,
         metric=True,
-        joints_m=joints,
         depth=DepthFiles(paths=files, unit_m=1.0) if files[0] else None,
-        provenance={
-            "poses": str(poses_folder.relative_to(clip)),
-            "scale": "estimated by Depth Anything 3",
-            **counts,
-        },
+        provenance={"poses": str(poses_folder.relative_to(clip)), **notes},
     )
+    hands = sorted((clip / "_proc" / "mano_full").rglob("*.json"))
+    if not hands or recording.cameras is None:
+        return recording
+    cameras = replace(recording.cameras, world_from_camera=poses)
+    return with_joints(recording, read_hamer(hands[0], cameras, info)[rows])
 
 
 def _of_video(clip: Path, video: Path, info: VideoInfo) -> Recording:
@@ -125,15 +118,8 @@ def _of_video(clip: Path, video: Path, info: VideoInfo) -> Recording:
     text = ""
     if caption.exists():
         text = read_bytes(caption, limit=MAX_CAPTION_BYTES).decode("utf-8-sig", "replace").strip()
-    return Recording(
-        recording_id=make_id([clip.resolve().name]),
-        video=video,
-        frames=info.frames,
-        fps=info.fps,
-        height=info.height,
-        width=info.width,
-        caption=text or None,
-        provenance={"poses": "unknown: none"},
+    return Recording.of_video(
+        video, info, caption=text or None, provenance={"poses": "unknown: none"}
     )
 
 

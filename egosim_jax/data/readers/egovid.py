@@ -36,7 +36,7 @@ from egosim_jax.data.pairing import pair_rows
 from egosim_jax.data.readers import Entry, find_files, make_id
 from egosim_jax.data.recording import Recording
 from egosim_jax.geometry import invert
-from egosim_jax.io.bounded import open_regular, quote_path, quote_text, read_bytes
+from egosim_jax.io.bounded import open_regular, quote_path, quote_text, read_bytes, refusing
 from egosim_jax.io.untrusted.npz import read_npy
 from egosim_jax.io.video import VideoInfo, probe_video, read_video
 from egosim_jax.types import InputError
@@ -119,14 +119,11 @@ def _read(
         frames = frames if poses is None else len(poses)
     caption = row.get("llava_cap", "").strip() or row.get("name", "").strip()
     nouns = [noun.strip() for noun in row.get("noun_cls", "").split(",")]
-    return Recording(
-        recording_id=make_id([video_id]),
-        video=video,
+    return Recording.of_video(
+        video,
+        info,
         start=start,
         frames=frames,
-        fps=info.fps,
-        height=info.height,
-        width=info.width,
         world_from_camera=poses,
         intrinsics_px=intrinsics,
         caption=caption or None,
@@ -178,12 +175,8 @@ def _halve(frame: np.ndarray) -> np.ndarray:
 def read_matrices(path: Path, shape: tuple[int | None, ...]) -> np.ndarray:
     """Return the finite numbers of an npy file as float64; None in a shape allows any size."""
     name = quote_path(path)
-    try:
+    with refusing(f"{name} is not a readable npy file"):
         values = read_npy(read_bytes(path, limit=MAX_NPY_BYTES), name)
-    except ValueError as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{name} is not a readable npy file: {quote_text(str(error))}.") from error
     fits = values.ndim == len(shape)
     if not fits or any(n not in (None, size) for size, n in zip(values.shape, shape, strict=True)):
         raise InputError(f"{name} has shape {values.shape}; expected {shape}.")

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 
+from egosim_jax.data.recording import Recording
 from egosim_jax.types import HAND_SIZE_M, Cameras, InputError, near_view
 
 
@@ -27,9 +30,9 @@ def clean_joints(
     low, high = HAND_SIZE_M
     odd = finite & ~((extent >= low) & (extent <= high))
     joints[odd] = np.nan
-    given = np.isfinite(joints).all(axis=(2, 3)).any(axis=0)
-    seen = given if cameras is None else near_view(cameras, joints).any(axis=0)
-    if given.any() and not seen.any():
+    present = np.isfinite(joints).all(axis=(2, 3)).any(axis=0)
+    seen = present if cameras is None else near_view(cameras, joints).any(axis=0)
+    if present.any() and not seen.any():
         raise InputError(
             "No hand joint comes near the view of the camera in any frame: joints and camera poses "
             "must be in one world, in meters. The recording cannot be used for hands."
@@ -37,6 +40,12 @@ def clean_joints(
     joints[:, ~seen] = np.nan
     counts = {
         "hands_implausible": int(odd.sum()),
-        "hands_never_in_view": int((given & ~seen).sum()),
+        "hands_never_in_view": int((present & ~seen).sum()),
     }
     return joints, {name: str(count) for name, count in counts.items() if count}
+
+
+def with_joints(recording: Recording, joints_m: Float[np.ndarray, "f n j 3"] | None) -> Recording:
+    """Return a recording with clean joints; its provenance ends with the counts."""
+    joints, counts = clean_joints(joints_m, recording.cameras)
+    return replace(recording, joints_m=joints, provenance={**recording.provenance, **counts})

@@ -19,7 +19,7 @@ import re
 import tarfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
@@ -29,7 +29,8 @@ import numpy as np
 import tyro
 
 from egosim_jax.data.readers import Entry, find_files, make_id
-from egosim_jax.data.readers.hands import clean_joints
+from egosim_jax.data.readers.hands import with_joints
+from egosim_jax.data.readers.images import write_recording
 from egosim_jax.data.readers.lenses import Lens, Remap
 from egosim_jax.data.readers.rotations import make_poses
 from egosim_jax.data.readers.umetrack import FINGERS, HINGES, HandModel
@@ -44,8 +45,7 @@ from egosim_jax.io.bounded import (
 )
 from egosim_jax.io.images import decode_image
 from egosim_jax.io.timing import row_times
-from egosim_jax.io.writing import write_frames
-from egosim_jax.types import Cameras, InputError
+from egosim_jax.types import InputError
 
 COLOR = "214-1"
 """Stream of Aria's color camera."""
@@ -98,30 +98,21 @@ class Hot3D:
             turned = self.stream == COLOR
             images = remap.apply(clip.image(f"{key}.image_{self.stream}.jpg") for key in keys)
             frames = (np.rot90(image, -1) for image in images) if turned else images
-            _, height, width = write_frames(folder / "video.mp4", frames, fps)
+            recording = write_recording(folder, frames, fps)
             joints = clip.hands(keys)
         intrinsics = remap.intrinsics_px.copy()
         if turned:
             poses[:, :3, :3] = poses[:, :3, :3] @ CLOCKWISE
             (fx, _, cx), (_, fy, cy), _ = intrinsics.tolist()
             intrinsics = np.array([[fy, 0, lens.height - 1 - cy], [0, fx, cx], [0, 0, 1]])
-        seen = Cameras(
-            world_from_camera=poses, intrinsics_px=intrinsics, height=height, width=width
-        )
-        joints, counts = clean_joints(joints, seen)
-        return Recording(
-            recording_id=make_id([path.stem]),
-            video=folder / "video.mp4",
-            frames=len(keys),
-            fps=fps,
-            height=height,
-            width=width,
+        recording = replace(
+            recording,
             world_from_camera=poses,
             intrinsics_px=intrinsics,
             metric=True,
-            joints_m=joints,
-            provenance={"turned": "clockwise" if turned else "no", **counts},
+            provenance={"turned": "clockwise" if turned else "no"},
         )
+        return with_joints(recording, joints)
 
 
 class _Clip:

@@ -9,13 +9,13 @@ from datetime import datetime, timedelta
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path, PurePath
-from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from egosim_jax.data.readers import NOTE
 from egosim_jax.data.readers.lenses import Lens, Remap
+from egosim_jax.data.recording import UNNAMED, Recording
 from egosim_jax.io.bounded import quote_text
 from egosim_jax.io.images import read_image
 from egosim_jax.io.writing import write_frames
@@ -33,31 +33,25 @@ _MOMENT = re.compile(
 """Date and time, or seconds since 1970, perhaps with decimals."""
 
 
-@no_type_check
-@dataclass(frozen=True, kw_only=True)
-class ImageVideo:
-    """Video written from images, and its pinhole camera."""
-
-    path: Path
-    frames: int
-    height: int
-    width: int
-    intrinsics_px: Float[np.ndarray, "3 3"]
-    remap: Remap | None
-    """Remapping of the images; None if their lens is a pinhole."""
+def write_recording(folder: Path, images: Iterable[np.ndarray], fps: Fraction) -> Recording:
+    """Write images as video.mp4 in a folder; return its recording."""
+    path = folder / "video.mp4"
+    frames, height, width = write_frames(path, images, fps)
+    return Recording(
+        recording_id=UNNAMED, video=path, frames=frames, fps=fps, height=height, width=width
+    )
 
 
 def write_images(
     folder: Path, images: Iterable[np.ndarray], lens: Lens, fps: Fraction
-) -> ImageVideo:
-    """Write images as video.mp4 in a folder; remap them if their lens is not a pinhole."""
+) -> tuple[Recording, Remap | None]:
+    """Write images as video.mp4 in a folder; return its recording, and their remapping.
+
+    Images whose lens is a pinhole are not remapped.
+    """
     remap = None if lens.is_pinhole() else Remap.of(lens)
-    intrinsics = lens.intrinsics_px if remap is None else remap.intrinsics_px
-    path = folder / "video.mp4"
     frames = _checked(images, lens) if remap is None else remap.apply(images)
-    count, height, width = write_frames(path, frames, fps)
-    return ImageVideo(path=path, frames=count, height=height, width=width,
-                      intrinsics_px=intrinsics, remap=remap)  # fmt: skip
+    return write_recording(folder, frames, fps), remap
 
 
 def _checked(images: Iterable[np.ndarray], lens: Lens) -> Iterator[np.ndarray]:

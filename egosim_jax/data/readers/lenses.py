@@ -22,6 +22,7 @@ from typing import Literal, no_type_check
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from egosim_jax.geometry import pixel_rays
 from egosim_jax.types import InputError
 
 MAX_SPREAD = 0.01
@@ -141,8 +142,7 @@ class Remap:
         import cv2
 
         height, width = self.lens.height, self.lens.width
-        rows, columns = np.mgrid[:height, :width].astype(float)
-        rays = _rays(self.intrinsics_px, np.stack([columns, rows], axis=-1))
+        rays = pixel_rays(self.intrinsics_px, height=height, width=width)
         x, y = np.moveaxis(self.lens.project(rays).astype(np.float32), -1, 0)
         for image in images:
             if image.shape != (height, width, 3):

@@ -157,15 +157,13 @@ def _read(
             tasks = read_texts(episode.data).get(episode.index, ())
         except InputError as error:
             logger.warning("Episode %d: its tasks stay unknown: %s", episode.index, error)
-    return Recording(
-        recording_id=f"episode_{episode.index:06d}",
-        video=episode.video,
+    return Recording.of_video(
+        episode.video,
+        info,
         start=start or 0,
         times_s=times_s if start is None else None,
         frames=len(times_s),
         fps=fps,
-        height=info.height,
-        width=info.width,
         caption="; ".join(tasks) or None,
     )
 
@@ -287,7 +285,7 @@ def _is_depth(feature: Mapping[str, Any]) -> bool:
 
 
 def _episodes_v2(root: Path, info: Mapping[str, Any], camera: str) -> Iterator[_Episode | str]:
-    chunk = info.get("chunks_size", 1000)
+    chunk, template = info.get("chunks_size", 1000), info.get("video_path")
     if type(chunk) is not int or chunk < 1:
         raise InputError(f"meta/info.json: chunks_size is {quote(chunk)}, not a positive number.")
     for line, row in read_lines(root / "meta" / "episodes.jsonl", last="read"):
@@ -299,7 +297,7 @@ def _episodes_v2(root: Path, info: Mapping[str, Any], camera: str) -> Iterator[_
             fields = {"episode_chunk": number // chunk, "episode_index": number}
             yield _Episode(
                 index=number,
-                video=_video_path(root, info, camera, fields),
+                video=_fill(root, template, {**fields, "video_key": camera}, what="video_path"),
                 start_s=0.0,
                 stop_s=None,
                 data=_data_path(root, info, fields),
@@ -317,7 +315,7 @@ def _episodes_v3(root: Path, info: Mapping[str, Any], camera: str) -> Iterator[_
         raise InputError(f"{root} has no meta/episodes/chunk-*/file-*.parquet.")
     names = ("chunk_index", "file_index", "from_timestamp")
     place = {n: f"videos/{camera}/{n}" for n in names}
-    stop = f"videos/{camera}/to_timestamp"
+    stop, template = f"videos/{camera}/to_timestamp", info.get("video_path")
     for path in paths:
         table = read_parquet(
             path,
@@ -334,7 +332,7 @@ def _episodes_v3(root: Path, info: Mapping[str, Any], camera: str) -> Iterator[_
                 data = {n: row.get(f"data/{n}") for n in ("chunk_index", "file_index")}
                 yield _Episode(
                     index=index,
-                    video=_video_path(root, info, camera, fields),
+                    video=_fill(root, template, {**fields, "video_key": camera}, what="video_path"),
                     start_s=start_s,
                     stop_s=float("inf") if end_s is None else _time(end_s, "to_timestamp"),
                     data=_data_path(root, info, data),
@@ -366,12 +364,6 @@ def read_tasks(root: Path) -> dict[int, str]:
         raise InputError("meta/tasks.parquet has neither an index of texts nor a column task.")
     pairs = zip(table["task_index"], texts, strict=True)
     return {index: text for index, text in pairs if isinstance(text, str)}
-
-
-def _video_path(
-    root: Path, info: Mapping[str, Any], camera: str, fields: Mapping[str, int]
-) -> Path:
-    return _fill(root, info.get("video_path"), {**fields, "video_key": camera}, what="video_path")
 
 
 def _data_path(root: Path, info: Mapping[str, Any], fields: Mapping[str, Any]) -> Path | None:

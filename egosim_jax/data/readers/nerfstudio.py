@@ -14,7 +14,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -25,7 +25,6 @@ import tyro
 from egosim_jax.data.readers import Entry, inside, make_id, make_rate, natural_order
 from egosim_jax.data.readers.images import (
     MAX_IMAGES,
-    ImageVideo,
     describe_run,
     longest_run,
     read_posed,
@@ -109,20 +108,16 @@ class Nerfstudio:
         lens = _read_lens(written, frames, path)
         self._check_scale(written, path)
         poses = np.stack([_pose(entry) for entry in frames]) @ OPENCV_FROM_OPENGL
-        video = write_images(folder, (read_posed(image, lens) for image, _ in images), lens, fps)
-        return Recording(
-            recording_id=make_id([path.resolve().parent.name]),
-            video=video.path,
-            frames=video.frames,
-            fps=fps,
-            height=video.height,
-            width=video.width,
+        pixels = (read_posed(image, lens) for image, _ in images)
+        recording, remap = write_images(folder, pixels, lens, fps)
+        return replace(
+            recording,
             world_from_camera=poses,
-            intrinsics_px=video.intrinsics_px,
+            intrinsics_px=(remap or lens).intrinsics_px,
             metric=self.metric,
-            depth=_find_depth(path.parent, frames, video),
+            depth=_find_depth(path.parent, frames) if remap is None else None,  # not remapped
             provenance={
-                "lens": "pinhole" if video.remap is None else "remapped",
+                "lens": "pinhole" if remap is None else "remapped",
                 **describe_run(names, run),
             },
         )
@@ -242,10 +237,9 @@ def _problem(image: Path, entry: Mapping[str, Any], path: Path) -> str | None:
     return None if os.path.lexists(image) else f"{quote_path(image)} is missing."
 
 
-def _find_depth(root: Path, frames: list[dict[str, Any]], video: ImageVideo) -> DepthFiles | None:
-    """Return depth files; None if the images were remapped, because depth is not."""
+def _find_depth(root: Path, frames: list[dict[str, Any]]) -> DepthFiles | None:
     names = [entry.get("depth_file_path") for entry in frames]
-    if not any(names) or video.remap is not None:
+    if not any(names):
         return None
     paths = [name and inside(root, name, what="depth_file_path") for name in names]
     return DepthFiles(paths=tuple(path or None for path in paths), unit_m=0.001)

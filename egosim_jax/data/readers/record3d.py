@@ -26,7 +26,7 @@ import logging
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
 from importlib.util import find_spec
@@ -56,10 +56,10 @@ from egosim_jax.io.bounded import (
     quote_path,
     quote_text,
     read_bytes,
+    refusing,
 )
 from egosim_jax.io.images import decode_image
 from egosim_jax.io.timing import row_times
-from egosim_jax.io.untrusted.npz import DAMAGE
 from egosim_jax.io.untrusted.zipped import from_file
 from egosim_jax.types import InputError, is_rigid
 
@@ -133,17 +133,12 @@ def _read(path: Path, folder: Path) -> Recording:
             decode_image(read(name), name=quote_text(name), pixels="stored")
             for name in map(numbered.__getitem__, numbers)
         )
-        video = write_images(folder, images, lens, fps)
+        recording, remap = write_images(folder, images, lens, fps)
         depth, why = _write_depth(names, read, metadata, numbers, path, folder)
-    return Recording(
-        recording_id=make_id([path.resolve().stem]),
-        video=video.path,
-        frames=video.frames,
-        fps=fps,
-        height=video.height,
-        width=video.width,
+    return replace(
+        recording,
         world_from_camera=poses,
-        intrinsics_px=video.intrinsics_px if np.isfinite(spread) else None,
+        intrinsics_px=(remap or lens).intrinsics_px if np.isfinite(spread) else None,
         metric=poses is not None,
         depth=depth,
         provenance={"focal_spread": f"{spread:.4f}", "depth": why, **notes},
@@ -159,26 +154,15 @@ def _open_capture(path: Path) -> Iterator[tuple[list[str], ReadFile]]:
         yield names, lambda name: read_bytes(path / name, limit=MAX_FILE_BYTES)
         return
     with open_regular(path) as file:
-        with _refusing(path):
+        damage = f"{quote_path(path)} is not a readable .r3d file"
+        with refusing(damage):
             archive = from_file(file)
 
         def read(name: str) -> bytes:
-            with _refusing(path):
+            with refusing(damage):
                 return archive.read(name, limit=MAX_FILE_BYTES)
 
         yield list(archive.entries), read
-
-
-@contextmanager
-def _refusing(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except DAMAGE as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(
-            f"{quote_path(path)} is not a readable .r3d file: {quote_text(str(error))}."
-        ) from error
 
 
 def _read_metadata(names: list[str], read: ReadFile, path: Path) -> dict[str, Any]:

@@ -60,13 +60,9 @@ class TasteRob:
 def _read(root: Path, name: str, caption: str, folder: Path) -> Recording:
     video = inside(root, name, what="the video of a row")
     info = probe_video(video)
-    return Recording(
-        recording_id=make_id([video.stem]),
-        video=video,
-        frames=info.frames,
-        fps=info.fps,
-        height=info.height,
-        width=info.width,
+    return Recording.of_video(
+        video,
+        info,
         world_from_camera=np.tile(np.eye(4), (info.frames, 1, 1)),
         caption=caption or None,
         provenance={"camera": "fixed"},

@@ -21,8 +21,7 @@ from egosim_jax.perception.oracle import motions_of
 from egosim_jax.perception.pipeline import Observation
 from egosim_jax.rendering.hand_mesh import pose_hands
 from egosim_jax.rendering.mesh import Side, hand_mask
-from egosim_jax.rendering.mesh_reference import draw_mesh
-from egosim_jax.rendering.reference import draw_hands, render
+from egosim_jax.rendering.reference import draw_hands, draw_mesh, render
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.state.silhouettes import unmix_colors
 from egosim_jax.types import (
@@ -34,7 +33,7 @@ from egosim_jax.types import (
     Kind,
     SceneState,
     Triplet,
-    near_view,
+    seen_hands,
 )
 from egosim_jax.worlds.tabletop.bodies import Part
 from egosim_jax.worlds.tabletop.raycast import Frame, Placed, RayCaster
@@ -293,14 +292,6 @@ def to_action(clip: TabletopClip) -> Action:
     """
     joints = seen_hands(clip.cameras, clip.joints_m)
     return Action(cameras=clip.cameras, joints_m=joints, kind=clip.kind, prompt=clip.caption)
-
-
-def seen_hands(
-    cameras: Cameras, joints_m: Float[np.ndarray, "f n j 3"]
-) -> Float[np.ndarray, "f n j 3"]:
-    """Return the joints with NaN for hands that are never in view."""
-    seen = np.asarray(near_view(cameras, joints_m).any(axis=0))[:, None, None]
-    return joints_m if seen.all() else np.where(seen, joints_m, np.nan)
 
 
 def to_episode(clips: Sequence[TabletopClip], *, fps: int) -> Episode:

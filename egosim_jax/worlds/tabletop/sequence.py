@@ -14,14 +14,13 @@ from jaxtyping import Float
 
 from egosim_jax.geometry import look_at
 from egosim_jax.simulation.episode import Episode
-from egosim_jax.types import Action, Cameras, Kind, SceneState, VideoSpec
+from egosim_jax.types import Action, Cameras, Kind, SceneState, VideoSpec, seen_hands
 from egosim_jax.worlds.tabletop import hand_motion
 from egosim_jax.worlds.tabletop.clips import (
     TabletopClip,
     first_view,
     provenance,
     render_clip,
-    seen_hands,
 )
 from egosim_jax.worlds.tabletop.hand_motion import Hand, Intent, Moment
 from egosim_jax.worlds.tabletop.raycast import Frame

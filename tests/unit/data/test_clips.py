@@ -28,27 +28,20 @@ def files(clips):
     return read_metadata(clips)[0]
 
 
-def shorten(path, frames):
-    write_video(path, read_video(path).frames[:frames], 16)
-
-
-def shrink(path, height, width):
-    write_video(path, read_video(path).frames[:, :height, :width], 16)
+def rewrite(path, *part):
+    """Keep a part of the frames, rows and columns of a video."""
+    write_video(path, read_video(path).frames[part], 16)
 
 
 def test_a_clip_of_the_models_size_passes_unchanged(files):
     triplet = load_triplet(files, NATIVE)
+    assert (triplet.video_id, triplet.prompt) == ("clip0", "hands move, clip 0")
+    assert triplet.extra == {"split": "train"}
     np.testing.assert_array_equal(triplet.prior, read_video(files.prior).frames)
     np.testing.assert_array_equal(triplet.hands, read_video(files.hands).frames)
     np.testing.assert_array_equal(triplet.target, read_video(files.target).frames)
     np.testing.assert_array_equal(triplet.mask, read_video(files.mask).frames[..., 0])
     np.testing.assert_array_equal(triplet.first_frame, read_image(files.first_frame))
-
-
-def test_id_prompt_and_further_columns_come_from_the_metadata(files):
-    triplet = load_triplet(files, NATIVE)
-    assert (triplet.video_id, triplet.prompt) == ("clip0", "hands move, clip 0")
-    assert triplet.extra == {"split": "train"}
 
 
 def test_colors_are_stretched_with_lanczos(files):
@@ -75,12 +68,6 @@ def test_a_portrait_is_not_stretched_to_a_landscape_unless_it_is_wanted(files):
     assert load_triplet(files, tall, policy="lenient").prior.shape[1:3] == (64, 32)
 
 
-def test_a_longer_clip_gives_the_window_at_start_and_its_own_image(files):
-    triplet = load_triplet(files, dataclasses.replace(NATIVE, frames=5), start=3)
-    np.testing.assert_array_equal(triplet.hands, read_video(files.hands).frames[3:8])
-    np.testing.assert_array_equal(triplet.first_frame, read_image(files.first_frame))
-
-
 def test_the_first_frame_may_be_a_video(files):
     files = dataclasses.replace(files, first_frame=files.target)
     np.testing.assert_array_equal(
@@ -102,19 +89,19 @@ def test_strict_refuses_a_missing_file_by_row_and_path(files, name):
     ]
 
 
-def disagree_in_length(files):
-    shorten(files.hands, 5)
+def shorten(files):
+    rewrite(files.hands, slice(5))
 
 
-def disagree_in_size(files):
-    shrink(files.hands, 16, 48)
+def shrink(files):
+    rewrite(files.hands, slice(9), slice(16))
 
 
 @pytest.mark.parametrize(
     ("clip", "change", "start", "message"),
     [
-        ({}, disagree_in_length, 0, r"disagree: prior 9, hands 5, mask 9, target 9.*\(egosim gen"),
-        ({}, disagree_in_size, 0, "disagree: prior 48x32, hands 48x16"),
+        ({}, shorten, 0, r"disagree: prior 9, hands 5, mask 9, target 9.*\(egosim gen"),
+        ({}, shrink, 0, "disagree: prior 48x32, hands 48x16"),
         ({}, lambda files: cut_off(files.hands), 0, r"metadata\.csv line 2 \(clip0\).*is cut off"),
         ({}, lambda files: files.prior.write_bytes(b"x"), 0, "prior.*is not a readable video"),
         ({}, None, 3, "9 frames are fewer than the 12"),
@@ -133,20 +120,20 @@ def test_strict_refuses_a_clip_that_would_have_to_be_changed(
 
 
 def test_lenient_repeats_the_last_frame(files):
-    shorten(files.hands, 6)
+    rewrite(files.hands, slice(6))
     hands = load_triplet(files, NATIVE, policy="lenient").hands
     have = read_video(files.hands).frames
     np.testing.assert_array_equal(hands, have[[0, 1, 2, 3, 4, 5, 5, 5, 5]])
 
 
 def test_lenient_cuts(files):
-    shorten(files.prior, 6)
+    rewrite(files.prior, slice(6))
     triplet = load_triplet(files, dataclasses.replace(NATIVE, frames=5), policy="lenient")
     np.testing.assert_array_equal(triplet.prior, read_video(files.prior).frames[:5])
 
 
 def test_lenient_resizes_each_video(files):
-    shrink(files.hands, 16, 32)
+    rewrite(files.hands, slice(None), slice(16), slice(32))
     hands = load_triplet(files, NATIVE, policy="lenient").hands
     frame = Image.fromarray(read_video(files.hands).frames[0])
     expected = frame.resize((48, 32), Image.Resampling.LANCZOS)
@@ -269,13 +256,10 @@ def test_a_clip_may_be_larger_than_memory_should_hold(files, monkeypatch):
     np.testing.assert_array_equal(again.prior, whole.prior)
 
 
-def test_official_decoding_is_darker(files):
-    accurate = load_triplet(files, NATIVE)
+def test_the_decoding_can_be_chosen(files):
     official = load_triplet(files, NATIVE, decoding="official")
-    np.testing.assert_array_equal(
-        official.prior, read_video(files.prior, decoding="official").frames
-    )
-    assert (accurate.prior.astype(float) - official.prior).mean() > 0.2
+    expected = read_video(files.prior, decoding="official").frames
+    np.testing.assert_array_equal(official.prior, expected)
 
 
 @pytest.mark.parametrize("name", ["prior", "first_frame"])
@@ -285,26 +269,6 @@ def test_a_pipe_or_a_name_with_nul_is_a_problem_of_its_clip(files, name):
     for path in (pipe, pipe.with_name("a\0.mp4")):
         (problem,) = check_clip(dataclasses.replace(files, **{name: path}), NATIVE)
         assert "not a regular file" in problem or "null" in problem
-
-
-@pytest.mark.parametrize(
-    ("rates", "rule", "expected"),
-    [
-        ((16, 16), "first", range(5)),
-        ((30, 16), "rate", (0, 2, 4, 6, 8)),
-        ((30, 8), "rate", (0, 4, 8)),
-        ((12, 8), "rate", (0, 2, 3, 5, 6)),
-        ((30, 8), "step", (0, 3, 6)),
-        ((Fraction(30000, 1001), 30), "first", range(5)),
-    ],
-)
-def test_frames_are_taken_at_the_models_rate(files, tmp_path, rates, rule, expected):
-    spec = dataclasses.replace(NATIVE, frames=5, fps=rates[1])
-    timed = at_rate(files, tmp_path, rates[0])
-    triplet = load_triplet(timed, spec, resampling=rule, policy="lenient")
-    every = load_triplet(timed, NATIVE, policy="lenient").prior
-    taken = every[[*expected, *[expected[-1]] * (5 - len(expected))]]
-    np.testing.assert_array_equal(triplet.prior, taken)
 
 
 @pytest.mark.parametrize(

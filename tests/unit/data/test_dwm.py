@@ -1,5 +1,6 @@
 """DWM's folders and lists: written clips are read back, and every mistake is named."""
 
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -81,12 +82,6 @@ def test_datasets_of_one_root_keep_their_clips_and_names(root):
             write_folders(root, own, name=name, fps=8)
 
 
-def test_a_list_may_be_in_the_root(root):
-    text = (root / "dataset_files" / "train.txt").read_text("utf-8")
-    (root / "own.txt").write_text(f"\n{text}\n", "utf-8")
-    assert len(read_metadata(root / "own.txt")) == 2
-
-
 def test_original_captions_serve_where_there_are_no_rewritten_ones(root):
     folder = root / "train" / "open"
     (folder / "prompts_rewrite" / "00000.txt").unlink()
@@ -95,11 +90,12 @@ def test_original_captions_serve_where_there_are_no_rewritten_ones(root):
 
 
 def original_captions(root):
-    """Write original captions that differ from the rewritten ones; return the list."""
+    """Write original captions that differ from the rewritten ones; return a list in the root."""
     for number, folder in enumerate(("open", "carry")):
         path = root / "train" / folder / "prompts" / "00000.txt"
         path.write_text(f"original {number}", "utf-8")
-    return clips_list(root)
+    (root / "own.txt").write_text(f"\n{clips_list(root).read_text('utf-8')}\n", "utf-8")
+    return root / "own.txt"
 
 
 def test_original_captions_can_be_chosen_and_are_then_required(root):
@@ -146,15 +142,6 @@ def test_wrong_lists_are_refused(root, lines, message):
         read_metadata(path)
 
 
-def test_videos_that_disagree_are_named(root):
-    clip = read_metadata(root / "dataset_files" / "train.txt")[0]
-    write_video(clip.hands, make_triplet("a").hands[:4], 8)
-    (problem,) = check_clip(clip, SPEC)
-    assert "frame counts disagree: prior 5, hands 4, target 5" in problem
-    write_video(clip.hands, make_triplet("a").hands[:, :16], 8)
-    assert "sizes disagree" in check_clip(clip, SPEC)[0]
-
-
 def test_videos_are_packed_without_a_mask_and_written_again(root, tmp_path):
     clips = read_metadata(root / "dataset_files" / "train.txt")
     shards = tmp_path / "shards"
@@ -182,6 +169,12 @@ def test_rules_of_resampling_are_those_of_dwm():
     assert resample(9, 5, "linspace").tolist() == [0, 2, 4, 6, 8]
     assert resample(8, 5, "linspace").tolist() == [0, 2, 4, 5, 7]  # half to even, as torch.round
     assert resample(3, 5, "linspace").tolist() == [0, 0, 1, 2, 2]
+
+
+def test_frames_by_rate_are_the_nearest_in_time():
+    assert resample(9, 5, "rate", ratio=Fraction(30, 16)).tolist() == [0, 2, 4, 6, 8]
+    assert resample(9, 5, "rate", ratio=Fraction(30, 8)).tolist() == [0, 4, 8]
+    assert resample(9, 5, "rate", ratio=Fraction(12, 8)).tolist() == [0, 2, 3, 5, 6]
 
 
 def test_frames_are_taken_at_intervals(root):
@@ -223,7 +216,5 @@ def test_videos_of_other_rates_are_not_taken_by_rate(root):
 
 
 def test_triplets_without_a_recorded_video_are_refused(tmp_path):
-    from dataclasses import replace
-
     with pytest.raises(InputError, match="must have a target"):
         write_folders(tmp_path, [replace(make_triplet("a"), target=None)], name="x", fps=8)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from egosim_jax.data.lerobot_statistics import (
+from egosim_jax.data.lerobot_writer import (
     QUANTILES,
     aggregate,
     image_statistics,

@@ -38,17 +38,21 @@ def test_axes_on_which_records_differ_are_none(tmp_path):
         (lambda fields: fields["spec"].update(frames=10), "4k[+]1"),
         (lambda fields: fields["spec"].update(run="rm"), "is not a manifest"),
         (lambda fields: fields.update(arrays=3), "is not a manifest"),
+        (lambda fields: fields["shards"][0].update(records="4"), "is not a manifest"),
+        (lambda fields: fields["shards"][0].update(size=1e300), "is not a manifest"),
+        (lambda fields: fields["shards"].append(fields["shards"][0]), "must list unique shards"),
+        (lambda fields: fields["arrays"]["target"].update(shape=["x"]), "is not a manifest"),
+        (lambda fields: fields["arrays"]["target"].update(dtype=["x"]), "is not a manifest"),
+        (lambda fields: fields["spec"].update(frames="9"), "of the spec is not an integer"),
+        (lambda fields: fields.update(provenance=[]), "is not a manifest"),
+        (lambda fields: fields.update(kind=["latents"]), "kind"),
+        (lambda fields: fields.update(version=[1]), "version"),
+        (lambda fields: fields.update(spec=[1]), "is not a manifest"),
     ],
 )
 def test_a_bad_manifest_is_refused(folder, change, message):
     rewrite_manifest(folder, change)
     with pytest.raises(InputError, match=message):
-        read_manifest(folder)
-
-
-def test_a_manifest_that_is_not_json_is_refused(folder):
-    (folder / MANIFEST).write_text("{")
-    with pytest.raises(InputError, match=r"manifest\.json is not valid JSON"):
         read_manifest(folder)
 
 
@@ -71,28 +75,7 @@ def test_a_changed_manifest_is_named(folder, change):
         read_manifest(folder)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda fields: fields["shards"][0].update(records="4"),
-        lambda fields: fields["shards"][0].update(size=1e300),
-        lambda fields: fields["shards"].append(fields["shards"][0]),
-        lambda fields: fields["arrays"]["target"].update(shape=["x"]),
-        lambda fields: fields["arrays"]["target"].update(dtype=["x"]),
-        lambda fields: fields["spec"].update(frames="9"),
-        lambda fields: fields.update(provenance=[]),
-        lambda fields: fields.update(kind=["latents"]),
-        lambda fields: fields.update(version=[1]),
-        lambda fields: fields.update(spec=[1]),
-    ],
-)
-def test_a_manifest_of_wrong_types_is_refused(folder, change):
-    rewrite_manifest(folder, change)
-    with pytest.raises(InputError):
-        read_manifest(folder)
-
-
-@pytest.mark.parametrize("text", ["[]", "3", '{"version": 1}', "[" * 100_000, "\ud800"])
+@pytest.mark.parametrize("text", ["{", "[]", "3", '{"version": 1}', "[" * 100_000, "\ud800"])
 def test_an_invalid_manifest_is_refused(folder, text):
     (folder / MANIFEST).write_bytes(text.encode("utf-8", "surrogatepass"))
     with pytest.raises(InputError):

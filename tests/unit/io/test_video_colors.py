@@ -94,6 +94,7 @@ def test_a_written_file_states_its_colors(tmp_path):
     write_video(tmp_path / "a.mp4", tabletop(), 8)
     with av.open(str(tmp_path / "a.mp4")) as container:
         coder = container.streams.video[0].codec_context
+        assert (coder.name, coder.pix_fmt) == ("h264", "yuv420p")
         stated = coder.colorspace, coder.color_range, coder.color_primaries, coder.color_trc
     assert stated == (6, 1, 1, 13)  # BT.601's matrix, limited range; BT.709's primaries, sRGB
 

@@ -117,6 +117,12 @@ READ: dict[str, tuple[str, np.ndarray, list[Track]]] = {
     "rounding-is-no-aspect": ("mp4", UP, [Track(image=UP, aspect=Fraction(1280, 1281))]),
     "rotated-90": ("mp4", np.rot90(UP), [Track(image=UP, rotation=90)]),
     "rotated-180": ("mov", np.rot90(UP, 2), [Track(image=UP, rotation=180)]),
+    "rotated-90-and-mirrored": (
+        "mp4", np.rot90(UP)[:, ::-1], [Track(image=UP, rotation=90, mirrored=True)],
+    ),
+    "rotated-180-and-mirrored": (
+        "mp4", UP[::-1], [Track(image=UP, rotation=180, mirrored=True)],
+    ),
     "rotated-270-and-aspect": (
         "mp4",
         np.rot90(UP, 3),
@@ -170,7 +176,6 @@ READ: dict[str, tuple[str, np.ndarray, list[Track]]] = {
     "ten-bits": ("mp4", UP, [Track(image=UP, codec="libx265", pix_fmt="yuv420p10le")]),
 }  # fmt: skip
 
-SDR_2020 = Track(image=UP, codec="libx265", pix_fmt="yuv420p10le", color=(9, 14, 9))
 PQ = Track(image=UP, codec="libx265", pix_fmt="yuv420p10le", color=(9, 16, 9))
 HLG = Track(image=UP, codec="libx265", pix_fmt="yuv420p10le", color=(9, 18, 9))
 REFUSED: dict[str, tuple[str, str, list[Track]]] = {

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from egosim_jax.geometry import look_at, pixel_rays, rotation_z, transform
-from egosim_jax.rendering import hand_mesh, mesh_jitted, mesh_reference
+from egosim_jax.rendering import hand_mesh, mesh_jitted, reference
 from egosim_jax.rendering.mesh import MovingMesh, hand_mask
 from egosim_jax.rendering.skeleton import SKELETONS
 from egosim_jax.types import Cameras, InputError
@@ -12,6 +12,11 @@ from egosim_jax.types import Cameras, InputError
 HEIGHT, WIDTH = 24, 40
 DIFFERENT = 2e-3
 """Share of pixels that may differ: rays through an edge, which float32 gives to either side."""
+
+
+@pytest.fixture(params=[reference, mesh_jitted], ids=["numpy", "jax"])
+def renderer(request):
+    return request.param
 
 
 def make_cameras(frames=1):
@@ -65,7 +70,6 @@ def soup(frames=2):
     return MovingMesh(vertices_m=vertices, triangles=triangles, colors=rng.uniform(size=(180, 3)))
 
 
-@pytest.mark.parametrize("renderer", [mesh_reference, mesh_jitted])
 def test_depth_is_that_of_a_loop_over_triangles(renderer):
     mesh, cameras = soup(), make_cameras(2)
     _, depth = renderer.draw_mesh(mesh, cameras)
@@ -78,7 +82,6 @@ def test_depth_is_that_of_a_loop_over_triangles(renderer):
     assert wrong.mean() <= DIFFERENT
 
 
-@pytest.mark.parametrize("renderer", [mesh_reference, mesh_jitted])
 def test_a_sphere_is_shaded_by_its_normals(renderer):
     import open3d as o3d
 
@@ -111,7 +114,7 @@ def test_a_sphere_is_shaded_by_its_normals(renderer):
 def test_the_two_renderers_draw_the_same_hands(hands):
     mesh, cameras = hand_mesh.pose_hands(hands), make_cameras(2)
     (first, near), (second, also) = (
-        renderer.draw_mesh(mesh, cameras) for renderer in (mesh_reference, mesh_jitted)
+        renderer.draw_mesh(mesh, cameras) for renderer in (reference, mesh_jitted)
     )
     assert first[0].any(axis=-1).mean() > 0.04
     differing = np.abs(first.astype(int) - second).max(axis=-1) > 1
@@ -120,7 +123,7 @@ def test_the_two_renderers_draw_the_same_hands(hands):
 
 
 def test_left_hands_are_green_right_ones_red_and_missing_ones_black(hands):
-    image, _ = mesh_reference.draw_mesh(hand_mesh.pose_hands(hands), make_cameras(2))
+    image, _ = reference.draw_mesh(hand_mesh.pose_hands(hands), make_cameras(2))
     left, right = image[:, :, : WIDTH // 2], image[:, :, WIDTH // 2 :]
     assert left[0].any()
     assert not left[1].any()

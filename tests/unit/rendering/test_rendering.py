@@ -19,6 +19,11 @@ MEASURED = [(247, 189, 247), (255, 167, 144), (244, 251, 253), (215, 255, 119), 
 """Colors from thumb to little finger, and as measured on the published videos."""
 
 
+@pytest.fixture(params=[reference, jitted], ids=["numpy", "jax"])
+def renderer(request):
+    return request.param
+
+
 def make_cameras(frames=3):
     up = np.array([0.0, 0.0, 1.0])
     eyes = [np.array([0.1 * i, -1.0, 0.4]) for i in range(frames)]
@@ -42,6 +47,13 @@ def scene():
     points[101] = np.inf
     colors = rng.integers(0, 256, (600, 3), dtype=np.uint8)
     return points.astype(np.float32), colors
+
+
+@pytest.fixture
+def state(scene):
+    points, colors = scene
+    finite = np.isfinite(points).all(axis=1)
+    return make_state(points[finite], colors[finite])
 
 
 def splat_by_hand(points, cameras, size):
@@ -80,14 +92,12 @@ def test_the_three_splatters_agree(scene, size):
         assert np.isinf(got_depth[got_index < 0]).all()
 
 
-@pytest.mark.parametrize("renderer", [reference, jitted])
 def test_of_equally_near_points_the_first_is_seen(renderer):
     points = np.array([[0, 0, 0], [0, 0, 0]], np.float32)
     _, index = renderer.splat(points, make_cameras(1), point_px=2)
     assert sorted(set(np.asarray(index).ravel())) == [-1, 0]
 
 
-@pytest.mark.parametrize("renderer", [reference, jitted])
 def test_a_square_that_begins_outside_the_image_still_shows(renderer):
     cameras = Cameras(
         world_from_camera=np.eye(4)[None],
@@ -100,7 +110,6 @@ def test_a_square_that_begins_outside_the_image_still_shows(renderer):
     assert set(rows) == set(columns) == {0}
 
 
-@pytest.mark.parametrize("renderer", [reference, jitted])
 def test_a_scene_behind_the_camera_is_black_and_not_observed(renderer, scene):
     points, colors = scene
     behind = points - np.array([0, 10, 0], np.float32)
@@ -110,7 +119,6 @@ def test_a_scene_behind_the_camera_is_black_and_not_observed(renderer, scene):
     assert (np.asarray(renderer.unobserved(index)) == 255).all()
 
 
-@pytest.mark.parametrize("renderer", [reference, jitted])
 def test_gamma_lifts_the_colors_of_points(renderer, scene):
     points, colors = scene
     _, index = renderer.splat(points, make_cameras(), point_px=2)
@@ -124,7 +132,6 @@ def test_gamma_lifts_the_colors_of_points(renderer, scene):
     assert not plain[~seen].any()
 
 
-@pytest.mark.parametrize("renderer", [reference, jitted])
 def test_both_masks_against_the_image(renderer, scene):
     points, _ = scene
     cameras = make_cameras()
@@ -208,7 +215,6 @@ def test_the_three_hand_renderers_agree(kind):
         np.testing.assert_allclose(got_depth[same], depth[same], rtol=1e-4)
 
 
-@pytest.mark.parametrize("renderer", [reference, jitted])
 def test_a_hand_that_is_missing_or_behind_the_camera_is_not_drawn(renderer):
     hands = make_hands(3)
     hands[0, :, 0] = np.nan
@@ -237,10 +243,7 @@ def make_state(points, colors):
 
 
 @pytest.mark.parametrize("size", [1, 2])
-def test_both_renderers_give_the_same_view(scene, size):
-    points, colors = scene
-    finite = np.isfinite(points).all(axis=1)
-    state = make_state(points[finite], colors[finite])
+def test_both_renderers_give_the_same_view(state, size):
     views = [r.render(state, make_cameras(), point_px=size) for r in (reference, jitted)]
     for name in ("frames", "mask", "depth_m", "object_ids"):
         expected, got = (getattr(view, name) for view in views)
@@ -257,10 +260,7 @@ FLAT = Cameras(
 
 
 @pytest.mark.parametrize("size", [1, 2])
-def test_both_renderers_draw_objects_on_their_predicted_paths(scene, size):
-    points, colors = scene
-    finite = np.isfinite(points).all(axis=1)
-    state = make_state(points[finite], colors[finite])
+def test_both_renderers_draw_objects_on_their_predicted_paths(state, size):
     ids = np.arange(len(state.points_m), dtype=np.int32) % 3
     state, cameras = replace(state, object_ids=ids), make_cameras()
     rng = np.random.default_rng(5)
@@ -288,7 +288,6 @@ def test_both_renderers_draw_objects_on_their_predicted_paths(scene, size):
             assert (view.frames[frame] != frames).mean() < DIFFERENT
 
 
-@pytest.mark.parametrize("renderer", [reference, jitted])
 def test_what_a_moved_object_uncovers_keeps_its_image_but_has_no_depth(renderer):
     wall = make_points(range(HEIGHT), range(10), 2.0)
     cup = make_points([8, 9, 10], [20, 21, 22], 1.0)
@@ -339,7 +338,6 @@ def close_by_hand(depth, index):
     return closed_depth, closed_index
 
 
-@pytest.mark.parametrize("renderer", [reference, jitted])
 def test_gaps_are_closed_as_by_hand(renderer, scene):
     points = np.concatenate([scene[0], scene[0] * np.float32(0.9)])
     cameras = reference.add_margin(make_cameras())
@@ -352,7 +350,6 @@ def test_gaps_are_closed_as_by_hand(renderer, scene):
     np.testing.assert_array_equal(got_depth, expected_depth)
 
 
-@pytest.mark.parametrize("renderer", [reference, jitted])
 def test_seams_and_outline_of_a_moved_object_are_closed(renderer):
     """Its points now have a distance of 1.5 pixels; around its former place a pixel is missing."""
     background = np.ones((HEIGHT, WIDTH), bool)
@@ -372,7 +369,6 @@ def test_seams_and_outline_of_a_moved_object_are_closed(renderer):
     np.testing.assert_array_equal(view.depth_m[0], np.where(shown == 200, 1, 2))
 
 
-@pytest.mark.parametrize("renderer", [reference, jitted])
 def test_a_gap_next_to_an_edge_shows_what_is_behind_the_edge(renderer):
     rows = np.arange(HEIGHT)
     near, far = make_points(rows, np.arange(10), 1), make_points(rows, np.arange(11, WIDTH), 2)
@@ -381,7 +377,6 @@ def test_a_gap_next_to_an_edge_shows_what_is_behind_the_edge(renderer):
     assert (view.frames[0, 1:-1, 10:] == 50).all()
 
 
-@pytest.mark.parametrize("renderer", [reference, jitted])
 @pytest.mark.parametrize("hole", [np.s_[5:8, 9:12], np.s_[:3, 30:], np.s_[10:21, 3:33]])
 def test_an_unobserved_area_of_three_pixels_or_more_keeps_its_shape(renderer, hole):
     unobserved = np.zeros((HEIGHT, WIDTH), bool)
@@ -392,7 +387,6 @@ def test_an_unobserved_area_of_three_pixels_or_more_keeps_its_shape(renderer, ho
     assert (np.isinf(view.depth_m) == unobserved).all()
 
 
-@pytest.mark.parametrize("renderer", [reference, jitted])
 def test_a_gap_at_the_border_needs_points_beyond_it(renderer):
     columns = np.arange(2, WIDTH)
     inner = make_points(np.arange(HEIGHT), columns, 1)
@@ -403,11 +397,8 @@ def test_a_gap_at_the_border_needs_points_beyond_it(renderer):
     assert view.frames[:, 1:-1].all()
 
 
-@pytest.mark.parametrize("renderer", [reference, jitted])
-def test_views_of_larger_points_show_the_points_alone(renderer, scene):
-    points, colors = scene
-    finite = np.isfinite(points).all(axis=1)
-    state, cameras = make_state(points[finite], colors[finite]), make_cameras()
+def test_views_of_larger_points_show_the_points_alone(renderer, state):
+    cameras = make_cameras()
     for size in (2, 3):
         depth, index = renderer.splat(state.points_m, cameras, point_px=size)
         view = renderer.render(state, cameras, point_px=size)
@@ -415,7 +406,6 @@ def test_views_of_larger_points_show_the_points_alone(renderer, scene):
         np.testing.assert_array_equal(view.frames, renderer.paint(index, state.colors, gamma=False))
 
 
-@pytest.mark.parametrize("renderer", [reference, jitted])
 def test_a_first_frame_without_points_is_refused(renderer):
     state = make_state(np.float32([[0, -5, 0]]), np.zeros((1, 3), np.uint8))
     with pytest.raises(InputError, match=r"None of the 1 points of the scene is visible"):

@@ -81,8 +81,8 @@ def lerobot(folder, world):
     return LeRobot(source=root)
 
 
-def nerfstudio(folder, world):
-    write_nerfstudio(folder / "desk", world, depth=True)
+def nerfstudio(folder, world, *, per_frame):
+    write_nerfstudio(folder / "desk", world, per_frame=per_frame, depth=True)
     return Nerfstudio(source=folder / "desk", fps=10.0, metric=True)
 
 
@@ -97,36 +97,49 @@ def taste_rob(folder, world):
     return TasteRob(source=folder / "set")
 
 
-@pytest.mark.parametrize(
-    ("write", "fps", "spans", "facts"),
-    [
-        (agibot, 30, [(0, 5), (5, 12)], "cameras"),
-        (agibot_with_a_lens, 30, [(0, 5), (5, 12)], "cameras"),
-        (partial(colmap, binary=False), 10, [(0, 12)], "cameras points"),
-        (partial(colmap, binary=True), 10, [(0, 12)], "cameras points"),
-        (egodex, 30, [(0, 12)], "cameras joints"),
-        (egosim, 16, [(0, 12)], "cameras joints depth"),
-        (egovid, 30, [(3, 9)], ""),
-        (lerobot, 30, [(0, 7), (7, 12)], ""),
-        (nerfstudio, 10, [(0, 12)], "cameras depth"),
-        (record3d, 60, [(0, 12)], "cameras"),
-        (taste_rob, 25, [(0, 12)], ""),
-    ],
-)
-def test_a_recording_has_the_frames_cameras_and_hands_that_were_written(
-    write, fps, spans, facts, world, tmp_path, imported
+CUP, TOWEL, LIFT = "Pick the cup", "Unfold the towel.", "Lift it, wait"
+ONION = "The wearer cuts an onion, slowly."
+DATASETS = [
+    (agibot, 30, [(0, 5), (5, 12)], "metric cameras", [CUP, "Place the cup"]),
+    (agibot_with_a_lens, 30, [(0, 5), (5, 12)], "metric cameras", [CUP, "Place the cup"]),
+    (partial(colmap, binary=False), 10, [(0, 12)], "cameras points", [None]),
+    (partial(colmap, binary=True), 10, [(0, 12)], "cameras points", [None]),
+    (egodex, 30, [(0, 12)], "metric cameras joints names", [TOWEL]),
+    (egosim, 16, [(0, 12)], "metric cameras joints depth", ["A person folds a towel."]),
+    (egovid, 30, [(3, 9)], "names", [ONION]),
+    (lerobot, 30, [(0, 7), (7, 12)], "", ["pick the cup", "place the cup; wait"]),
+    (partial(nerfstudio, per_frame=False), 10, [(0, 12)], "metric cameras depth", [None]),
+    (partial(nerfstudio, per_frame=True), 10, [(0, 12)], "metric cameras depth", [None]),
+    (record3d, 60, [(0, 12)], "metric cameras", [None]),
+    (taste_rob, 25, [(0, 12)], "fixed", [LIFT]),
+]
+NAMES = {egodex: ("towel", "table"), egovid: ("onion", "knife")}
+DEPTH_M = {egosim: 0.7, nerfstudio: 0.9}
+
+
+@pytest.mark.parametrize(("write", "fps", "spans", "facts", "captions"), DATASETS)
+def test_a_recording_has_the_frames_cameras_hands_and_texts_that_were_written(
+    write, fps, spans, facts, captions, world, tmp_path, imported
 ):
     recordings, problems = imported(write(tmp_path, world))
     assert not problems
-    assert len(recordings) == len(spans)
+    assert [read.caption for read in recordings.values()] == captions
+    dataset = getattr(write, "func", write)
     for (start, stop), read in zip(spans, recordings.values(), strict=True):
         assert (read.fps, read.width, read.height) == (fps, world.width, world.height)
         assert shown(read.read_frames().frames, FRAMES) == list(range(start, stop))
+        assert (read.metric, read.names) == ("metric" in facts, NAMES.get(write, ()))
         if "cameras" in facts:
             np.testing.assert_allclose(read.world_from_camera, world.poses[start:stop], atol=1e-6)
             np.testing.assert_allclose(read.intrinsics_px, world.intrinsics, atol=1e-4)
+        else:
+            poses = np.tile(np.eye(4), (FRAMES, 1, 1)) if "fixed" in facts else None
+            np.testing.assert_equal(read.world_from_camera, poses)
         if "joints" in facts:
-            np.testing.assert_allclose(read.joints_m, world.joints[start:stop], atol=HAND_M)
+            tolerance = HAND_M if write is egosim else 1e-6
+            np.testing.assert_allclose(read.joints_m, world.joints[start:stop], atol=tolerance)
         assert (read.points is not None) == ("points" in facts)
         if "depth" in facts:
             assert read.read_depth(0).shape == (world.height, world.width)
+            assert read.read_depth(0)[5, 5] == pytest.approx(DEPTH_M[dataset])
+            assert (read.read_depth(1) is None) == (write is egosim)

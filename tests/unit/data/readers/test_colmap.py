@@ -89,6 +89,15 @@ def write_model(
     return folder
 
 
+def assert_observed(recording, world, atol):
+    """The points are where the pixels that observe them are."""
+    points = recording.points
+    seen = points.points_m[points.indices][:, None]
+    local = transform(invert(world.poses)[points.frames], seen)[:, 0]
+    pixels = np.stack(project(recording.intrinsics_px, local), axis=1)
+    np.testing.assert_allclose(pixels, points.pixels_px, atol=atol)
+
+
 @pytest.mark.parametrize("binary", [True, False])
 def test_cameras_points_and_observations_are_those_of_the_scene(world, tmp_path, imported, binary):
     write_model(tmp_path / "room", world, binary=binary)
@@ -103,11 +112,7 @@ def test_cameras_points_and_observations_are_those_of_the_scene(world, tmp_path,
     assert len(points.points_m) == len(POINTS)
     assert points.error_px[0] == 0.25
     assert len(points.frames) == world.frames * len(POINTS)
-    local = transform(invert(world.poses)[points.frames], points.points_m[points.indices][:, None])[
-        :, 0
-    ]
-    u, v = project(world.intrinsics, local)
-    np.testing.assert_allclose(np.stack([u, v], 1), points.pixels_px, atol=1e-3)
+    assert_observed(recording, world, atol=1e-3)
 
 
 def test_images_of_a_radial_lens_are_remapped_and_so_are_observations(world, tmp_path, imported):
@@ -116,12 +121,7 @@ def test_images_of_a_radial_lens_are_remapped_and_so_are_observations(world, tmp
     )
     recording = imported(Colmap(source=tmp_path / "room", fps=10.0))[0]["room"]
     assert recording.provenance["lens"] == "remapped"
-    points = recording.points
-    local = transform(invert(world.poses)[points.frames], points.points_m[points.indices][:, None])[
-        :, 0
-    ]
-    u, v = project(recording.intrinsics_px, local)
-    np.testing.assert_allclose(np.stack([u, v], 1), points.pixels_px, atol=2e-3)
+    assert_observed(recording, world, atol=2e-3)
 
 
 def test_several_cameras_and_unknown_models_are_refused(world, tmp_path, imported):

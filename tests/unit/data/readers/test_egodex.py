@@ -66,20 +66,6 @@ def copy_episode(path):
     return path
 
 
-def test_cameras_hands_and_texts_are_read(world, tmp_path, imported):
-    write_episode(world, tmp_path / "set/part1/fold/0.hdf5")
-    done, problems = imported(EgoDex(source=tmp_path / "set"))
-    assert not problems
-    recording = done["part1_fold_0"]
-    world.assert_first(recording)
-    np.testing.assert_allclose(recording.world_from_camera, world.poses, atol=1e-6)
-    np.testing.assert_allclose(recording.intrinsics_px, world.intrinsics, atol=1e-4)
-    np.testing.assert_allclose(recording.joints_m, world.joints, atol=1e-6)
-    assert recording.metric
-    assert recording.caption == "Unfold the towel."
-    assert recording.names == ("towel", "table")
-
-
 def test_one_way_tasks_take_the_first_description(world, tmp_path, imported):
     attributes = {"llm_description": "Cut it.", "llm_description2": "?", "llm_type": "static"}
     write_episode(world, tmp_path / "0.hdf5", attributes=attributes)

@@ -23,20 +23,6 @@ def write_clip(folder, world, *, poses="poses_da3"):
     return target
 
 
-def test_cameras_depth_and_caption_are_read(world, tmp_path, imported):
-    write_clip(tmp_path / "samples/fold_1", world)
-    done, problems = imported(EgoSimClips(source=tmp_path / "samples"))
-    assert not problems
-    recording = done["fold_1"]
-    np.testing.assert_allclose(recording.world_from_camera, world.poses, atol=1e-6)
-    np.testing.assert_allclose(recording.intrinsics_px, world.intrinsics, atol=1e-4)
-    assert recording.caption == "A person folds a towel."
-    assert recording.read_depth(0)[0, 0] == pytest.approx(0.7)
-    assert recording.read_depth(1) is None
-    assert recording.fps == 16
-    world.assert_first(recording)
-
-
 def test_smoothed_poses_are_preferred(world, tmp_path, imported):
     write_clip(tmp_path / "fold_1", world)
     raw = world.poses.copy()

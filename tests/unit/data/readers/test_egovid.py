@@ -105,14 +105,6 @@ def test_without_poses_the_rest_is_read(plane, tmp_path, imported, caplog):
     assert "The poses stay unknown" in caplog.text
 
 
-def test_a_span_of_a_long_video_is_taken(world, tmp_path, imported):
-    write_set(tmp_path / "set", world, video=UUID, span=(3, 9), poses=world.poses[:2])
-    recording = imported(EgoVid(source=tmp_path / "set"))[0][f"{UUID}_3_9"]
-    assert (recording.start, recording.frames) == (3, 6)
-    corner = recording.read_frames().frames[:, 2:6, 2:6].mean(axis=(1, 2, 3))
-    np.testing.assert_allclose(corner, 10 + 20 * np.arange(3, 9), atol=8)
-
-
 @pytest.mark.parametrize(
     "poses",
     [np.zeros((20, 4, 4), complex), np.zeros((20, 3, 4)), np.full((20, 4, 4), np.nan), "object"],

@@ -1,7 +1,7 @@
 """A recording of images ends where images are missing, whatever their numbering."""
 
 import json
-import zipfile
+import shutil
 from datetime import datetime, timedelta
 
 import numpy as np
@@ -89,8 +89,7 @@ def test_the_run_of_a_colmap_model(world, tmp_path, imported, gone, run, deleted
 @pytest.mark.parametrize(("gone", "run"), [([3], slice(4, 12)), ([0, 8], slice(1, 8))])
 def test_the_run_of_a_record3d_capture(world, tmp_path, imported, gone, run):
     test_record3d.write_capture(tmp_path / "scan.r3d", world)
-    with zipfile.ZipFile(tmp_path / "scan.r3d") as archive:
-        archive.extractall(tmp_path / "room")
+    shutil.unpack_archive(tmp_path / "scan.r3d", tmp_path / "room", "zip")
     for number in gone:
         (tmp_path / f"room/rgbd/{number}.jpg").unlink()
     recording = imported(Record3D(source=tmp_path / "room"))[0]["room"]

@@ -24,18 +24,14 @@ def lens(model, coefficients):
     )
 
 
-def test_brown_agrees_with_opencv():
+@pytest.mark.parametrize(
+    ("model", "k", "project"),
+    [("brown", BROWN, cv2.projectPoints), ("fisheye", FISHEYE, cv2.fisheye.projectPoints)],
+)
+def test_brown_and_fisheye_agree_with_opencv(model, k, project):
     zero = np.zeros(3)
-    expected, _ = cv2.projectPoints(POINTS, zero, zero, INTRINSICS, np.array(BROWN))
-    np.testing.assert_allclose(lens("brown", BROWN).project(POINTS), expected[:, 0], atol=1e-9)
-
-
-def test_fisheye_agrees_with_opencv():
-    zero = np.zeros(3)
-    expected, _ = cv2.fisheye.projectPoints(
-        POINTS[:, None], zero, zero, INTRINSICS, np.array(FISHEYE)
-    )
-    np.testing.assert_allclose(lens("fisheye", FISHEYE).project(POINTS), expected[:, 0], atol=1e-9)
+    expected, _ = project(POINTS[:, None], zero, zero, INTRINSICS, np.array(k))
+    np.testing.assert_allclose(lens(model, k).project(POINTS), expected[:, 0], atol=1e-9)
 
 
 def test_fisheye624_agrees_with_colmap():

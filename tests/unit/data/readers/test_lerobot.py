@@ -2,7 +2,6 @@
 
 import json
 
-import numpy as np
 import pandas
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -73,19 +72,6 @@ def write_v2(root, world):
     lines = [{"episode_index": n, "tasks": tasks[n], "length": world.frames} for n in range(3)]
     text = "\n".join(json.dumps(line) for line in lines)
     (root / "meta/episodes.jsonl").write_text(text)
-
-
-def test_v3_episodes_that_share_a_file_are_separated(world, tmp_path, imported):
-    write_v3(tmp_path / "set", world)
-    done, problems = imported(LeRobot(source=tmp_path / "set"))
-    assert not problems
-    first, second = done["episode_000000"], done["episode_000001"]
-    world.assert_first(first)
-    assert (first.frames, second.start, second.frames) == (7, 7, 5)
-    corner = second.read_frames().frames[:, 2:6, 2:6].mean(axis=(1, 2, 3))
-    np.testing.assert_allclose(corner, 10 + 20 * np.arange(7, 12), atol=8)
-    assert (first.caption, second.caption) == ("pick the cup", "place the cup; wait")
-    assert first.world_from_camera is None
 
 
 def test_v3_tasks_are_read_from_frames_where_episodes_do_not_name_them(world, tmp_path, imported):

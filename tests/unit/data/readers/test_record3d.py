@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 import struct
 import zipfile
 
@@ -147,8 +148,7 @@ def test_without_poses_images_intrinsics_and_depth_are_read(world, tmp_path, imp
 )
 def test_depth_that_is_not_what_it_should_be_is_refused(world, tmp_path, imported, data, message):
     write_capture(tmp_path / "scan.r3d", world)
-    with zipfile.ZipFile(tmp_path / "scan.r3d") as archive:
-        archive.extractall(tmp_path / "room")
+    shutil.unpack_archive(tmp_path / "scan.r3d", tmp_path / "room", "zip")
     (tmp_path / "room/rgbd/4.depth").write_bytes(data)
     problem = imported(Record3D(source=tmp_path / "room"))[1]["room"]
     assert message in problem
@@ -173,8 +173,7 @@ def test_the_size_of_a_stream_is_known_before_it_is_unpacked(data):
 
 def test_a_folder_that_was_exported_is_read(world, tmp_path, imported):
     write_capture(tmp_path / "scan.r3d", world, images="rgb")
-    with zipfile.ZipFile(tmp_path / "scan.r3d") as archive:
-        archive.extractall(tmp_path / "room")
+    shutil.unpack_archive(tmp_path / "scan.r3d", tmp_path / "room", "zip")
     (tmp_path / "room/metadata").rename(tmp_path / "room/metadata.json")
     recording = imported(Record3D(source=tmp_path / "room"))[0]["room"]
     world.assert_first(recording)

@@ -1,23 +1,9 @@
-"""TASTE-Rob: videos and captions from a table, and a fixed camera."""
+"""TASTE-Rob: rows of tables that name no video, or one elsewhere."""
 
-import numpy as np
 import pytest
 
 from egosim_jax.data.readers.taste_rob import TasteRob
 from egosim_jax.types import InputError
-
-
-def test_videos_have_captions_and_a_fixed_camera(world, tmp_path, imported):
-    world.write_video(tmp_path / "set/clips/a.mp4")
-    (tmp_path / "set/list.csv").write_text(
-        'File_Name,caption\nclips/a.mp4,"Lift the cup, then wait"\n'
-    )
-    recording = imported(TasteRob(source=tmp_path / "set"))[0]["clips_a"]
-    assert recording.caption == "Lift the cup, then wait"
-    np.testing.assert_array_equal(recording.world_from_camera, np.tile(np.eye(4), (12, 1, 1)))
-    assert recording.intrinsics_px is None
-    assert not recording.metric
-    world.assert_first(recording)
 
 
 def test_rows_that_leave_the_folder_or_lack_a_video_are_named(world, tmp_path, imported):

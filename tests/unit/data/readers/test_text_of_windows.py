@@ -38,11 +38,14 @@ LINES = (
 )
 
 
+JSON_VARIANTS = ("bom_crlf", "trailing_blanks", "no_last_line_feed", "spaces")
+
+
 @pytest.mark.parametrize(
     ("variant", "name", "data"),
     [
         *((variant, "m.csv", TABLE) for variant in (*VARIANTS, "spaces")),
-        *((variant, "m.jsonl", LINES) for variant in ("bom_crlf", "trailing_blanks", "spaces")),
+        *((variant, "m.jsonl", LINES) for variant in JSON_VARIANTS),
     ],
 )
 def test_metadata(tmp_path, variant, name, data):

@@ -2,7 +2,6 @@
 
 from fractions import Fraction
 
-import av
 import h5py
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from egosim_jax.data.readers.agibot import AgiBot
 from egosim_jax.data.readers.egosim import EgoSimClips
 from egosim_jax.data.readers.nerfstudio import Nerfstudio
 from egosim_jax.data.readers.record3d import Record3D
-from egosim_jax.data.readers.taste_rob import TasteRob
+from tests.captures import encode
 from tests.unit.data.readers import test_agibot, test_egosim, test_nerfstudio, test_record3d
 
 PLACEHOLDERS = {
@@ -60,24 +59,10 @@ def test_poses_that_jitter_are_known(world, tmp_path, imported, write):
     np.testing.assert_allclose(recording.world_from_camera, world.poses, atol=1e-9)
 
 
-def test_a_camera_that_its_dataset_calls_fixed_is_at_rest(world, tmp_path, imported):
-    world.write_video(tmp_path / "set/a.mp4")
-    (tmp_path / "set/t.csv").write_text("video,caption\na.mp4,Pick the cup\n")
-    recording = imported(TasteRob(source=tmp_path / "set"))[0]["a"]
-    assert (recording.world_from_camera == np.eye(4)).all()
-
-
 @pytest.mark.parametrize("write", [write_agibot, write_egosim])
 def test_intrinsics_of_pixels_that_are_not_square_are_ambiguous(world, tmp_path, imported, write):
     reader, video = write(tmp_path / "set", world)
-    with av.open(str(video), "w") as container:
-        stream = container.add_stream("libx264", rate=30)
-        stream.width, stream.height, stream.pix_fmt = 96, world.height, "yuv420p"
-        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
-        for frame in world.video:
-            frame = av.VideoFrame.from_ndarray(frame, format="rgb24")
-            container.mux(stream.encode(frame.reformat(96, world.height)))
-        container.mux(stream.encode())
+    encode(video, world.video[:, :, :96], aspect=Fraction(4, 3))
     done, problems = imported(reader)
     assert not done
     assert "setsar=1" in next(iter(problems.values()))
