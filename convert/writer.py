@@ -31,13 +31,13 @@ from egosim_jax.io.mapped import (
     OURS,
     TensorInfo,
     header,
+    map_ahead,
     read_arrays,
     read_metadata,
     read_safetensors,
 )
 from egosim_jax.io.run import write_json
 from egosim_jax.runtime.progress import track_bytes
-from egosim_jax.runtime.threads import map_ahead
 from egosim_jax.types import InputError
 
 THREADS, AHEAD = 2, 3
