@@ -33,7 +33,6 @@ BASE_LAYER, LORA = ".base_layer.", ".lora_"
 MAX_DEPTH = 2
 """Levels of subfolders to search."""
 MAX_NETWORKS = 16
-"""Maximum number of networks in a checkpoint."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,15 +40,11 @@ class DetectedNetwork:
     """Network in a foreign checkpoint."""
 
     network: str
-    """Name of the network in a model."""
     table: Table
-    """Conversion table that detected it."""
     naming: str
-    """Naming of its tensors."""
     prefix: str
     """Prefix of all its keys, such as `diffusion_model.` in ComfyUI's files."""
     source: Source
-    """Checkpoint that has it."""
     others: tuple[str, ...] = ()
     """Longer prefixes of other networks in the checkpoint."""
 
@@ -79,11 +74,8 @@ class Folder:
     """Networks and tokenizer of a checkpoint file or folder."""
 
     path: Path
-    """File or folder that was searched."""
     found: tuple[DetectedNetwork, ...]
-    """Networks in the file or folder."""
     unknown: tuple[Source, ...]
-    """Checkpoints without a known network."""
     tokenizer: Path | None
     """Folder of the tokenizer, if any: the nearest of T5, else the nearest."""
 

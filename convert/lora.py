@@ -37,10 +37,11 @@ from egosim_jax.convert.lora_table import (
     said,
     settings_of,
 )
-from egosim_jax.convert.source import PTH, Source, sources
+from egosim_jax.convert.source import Source, sources
 from egosim_jax.convert.tables import weight_shapes
 from egosim_jax.io.bounded import listing, quote, quote_path, quote_text
 from egosim_jax.io.mapped import OURS, RefusedError, Tensor, read_metadata
+from egosim_jax.io.untrusted.pth import SUFFIXES
 from egosim_jax.models.lora import (
     BASE,
     MAX_RANK,
@@ -127,7 +128,7 @@ def _files(path: Path) -> tuple[Source, Source | None]:
 
     Raises `InputError` for one file of a folder with full weights.
     """
-    ends = () if path.is_dir() else (".safetensors", *PTH)
+    ends = () if path.is_dir() else (".safetensors", *SUFFIXES)
     near = (path.with_name(f"{IN_FULL}{end}") for end in ends)
     if full := next(filter(Path.exists, near), None):
         raise InputError(
@@ -241,7 +242,10 @@ def _translated(
     tensors = {name.key: source.tensors[name.key] for name in names}
     bad = [key for key, tensor in tensors.items() if not all_finite(tensor.array())]
     refuse([f"{key}: has values that are not finite" for key in bad])
-    _say_alpha(source, low.values())
+    if any(pair.alpha is None for pair in low.values()):
+        _say(source, "alpha is taken as the rank: no tensor, header or config says another")
+    if any(pair.alpha == 0 for pair in low.values()):
+        _say(source, "alpha 0 is taken as the rank, as kohya's trainers and LyCORIS do")
     changes: dict[str, Change] = {}
     linear = {at: pair for at, pair in low.items() if at.rule.transform == "linear"}
     for path in dict.fromkeys(at.path for at in linear):
@@ -269,7 +273,6 @@ class Pair(NamedTuple):
     alpha: float | None
     """Alpha as it is said; None or 0: the rank."""
     scale: float
-    """Factor of the product."""
 
     def product(self) -> np.ndarray:
         """Return the change of a convolution's kernel `[out, in, ...]`."""
@@ -320,14 +323,6 @@ def _alpha(location: Location, name: Name | None, source: Source) -> float | Non
     if (count := math.prod(tensor.shape)) != 1:
         raise RefusedError(f"has {count} numbers as alpha; expected one")
     return next(said({suffix[1]: tensor.array().item()}, str(location)))[2]
-
-
-def _say_alpha(source: Source, low: Collection[Pair]) -> None:
-    """Print a note for an alpha that is assumed."""
-    if any(pair.alpha is None for pair in low):
-        _say(source, "alpha is taken as the rank: no tensor, header or config says another")
-    if any(pair.alpha == 0 for pair in low):
-        _say(source, "alpha 0 is taken as the rank, as kohya's trainers and LyCORIS do")
 
 
 def _full(location: Location, tensor: Tensor, want: Shapes, *, low_rank: bool) -> Tensor:

@@ -79,7 +79,16 @@ def checkpoint(
                 f"{at.target} was trained in full. These checkpoints have full weights only "
                 "outside the blocks: merge the LoRA instead. (--merge)"
             )
-        values[key] = np.ascontiguousarray(at.rule.to_torch(_value(at.target, change, base)))
+        if isinstance(change, Value):
+            value = change.array
+        elif base is not None:
+            value = base[at.target].array().astype(np.float32) + change
+        else:
+            raise InputError(
+                f"{at.target} is a difference from the weights that the LoRA was trained on, and a "
+                "checkpoint has values: give these weights. (--base)"
+            )
+        values[key] = np.ascontiguousarray(at.rule.to_torch(value))
     return {stem: tensors for stem, tensors in ((naming.stem, low), (IN_FULL, values)) if tensors}
 
 
@@ -101,17 +110,3 @@ def _named(
     if lost := sorted(changes.keys() - written):
         raise InputError(f"The layout has no names for {listing(lost)}: merge them. (--merge)")
     return tensors, full
-
-
-def _value(
-    target: str, change: Value | np.ndarray, base: Mapping[str, Tensor] | None
-) -> np.ndarray:
-    """Return a full weight: a given value, or the base's value plus the difference."""
-    if isinstance(change, Value):
-        return change.array
-    if base is None:
-        raise InputError(
-            f"{target} is a difference from the weights that the LoRA was trained on, and a "
-            "checkpoint has values: give these weights. (--base)"
-        )
-    return base[target].array().astype(np.float32) + change

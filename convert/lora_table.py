@@ -104,7 +104,6 @@ class Location:
     """A weight, or one layer of a stacked weight."""
 
     target: str
-    """Path of the weight."""
     layer: int | None
     """Index of the block; None for a weight that is not stacked."""
     rule: Rule = field(compare=False)
@@ -123,7 +122,6 @@ class Name(NamedTuple):
     """Parts of the name of a tensor in a LoRA file."""
 
     key: str
-    """The complete name."""
     prefix: str
     """Text before the name of the layer."""
     layer: str
@@ -133,7 +131,6 @@ class Name(NamedTuple):
     role: str
     """A value of `ROLES`, or `value` for a weight in full."""
     adapter: str | None
-    """Name of the adapter, if any."""
 
 
 def locations(config: NetworkConfig) -> dict[str, Location]:

@@ -10,8 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
-from egosim_jax.convert.source import INDEX, PTH
+from egosim_jax.convert.source import INDEX
 from egosim_jax.io.bounded import MAX_JSON_BYTES
+from egosim_jax.io.untrusted.pth import SUFFIXES
 from egosim_jax.io.untrusted.zipped import LOCAL, Archive, Read
 
 TAIL = 1 << 20
@@ -57,7 +58,7 @@ def _spans(path: Path, read: Read, size: int) -> Spans:
         yield 8, read(8, min(int.from_bytes(length, "little"), MAX_JSON_BYTES))
     elif path.name.endswith(INDEX):
         yield 0, read(0, MAX_JSON_BYTES)
-    elif path.suffix in PTH:
+    elif path.suffix in SUFFIXES:
         yield from _archive_spans(read, size)
 
 

@@ -87,9 +87,9 @@ def to_torch(
         weights.append(
             Weight(
                 name=name,
-                shape=_fused([part.shape() for part in group]).shape,
+                shape=_fused([part.of(shape_only(part.tensor)) for part in group]).shape,
                 dtype=stored_as(group[0].tensor.dtype, dtype),
-                pieces=(partial(_to_torch, group),),
+                pieces=(lambda group=group: _fused([p.of(p.tensor.array()) for p in group]),),
             )
         )
     return weights
@@ -209,23 +209,13 @@ class _Part:
     tensor: Tensor
     layer: int | None
 
-    def array(self) -> np.ndarray:
-        """Return the values of the part."""
-        weight = self.tensor.array()
-        return self.rule.to_torch(weight if self.layer is None else weight[self.layer])
-
-    def shape(self) -> np.ndarray:
-        """Return an array of the part's shape that takes no memory."""
-        weight = shape_only(self.tensor)
+    def of(self, weight: np.ndarray) -> np.ndarray:
+        """Return the part of an array of the tensor's shape."""
         return self.rule.to_torch(weight if self.layer is None else weight[self.layer])
 
 
 def _to_jax(rule: Rule, tensor: Tensor) -> np.ndarray:
     return rule.to_jax(tensor.array())
-
-
-def _to_torch(parts: Sequence[_Part]) -> np.ndarray:
-    return _fused([part.array() for part in parts])
 
 
 def _fused(arrays: Sequence[np.ndarray]) -> np.ndarray:

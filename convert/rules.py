@@ -7,7 +7,7 @@ transform between the two. The same rules serve both directions. One error lists
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any
@@ -18,15 +18,23 @@ from einops import EinopsError, rearrange
 from egosim_jax.convert.finite import is_floating
 from egosim_jax.io.weights import WeightsError, mismatches
 
+LAYOUTS = {
+    "same": "... -> ...",
+    "linear": "o i -> i o",
+    "conv2d": "o i h w -> h w i o",
+    "conv3d": "o i t h w -> t h w i o",
+}
+"""Changes of axis layout by name."""
+
 
 @dataclass(frozen=True)
 class Rule:
     """Correspondence between one foreign tensor, or one per layer, and one weight.
 
     A `*` in `source` matches the layer index of a stacked block; such a rule stacks all layers
-    along the leading axis of `target`. `transform` is a key of `TRANSFORMS` or an einops pattern.
-    `part` (i, n) is the i-th of n equal parts of the source's first axis: n rules share a fused
-    projection.
+    along the leading axis of `target`. `transform` is a key of `LAYOUTS`, or an einops pattern from
+    the foreign layout to ours without composed axes. `part` (i, n) is the i-th of n equal parts of
+    the source's first axis: n rules share a fused projection.
     """
 
     source: str
@@ -42,15 +50,17 @@ class Rule:
     def to_jax(self, tensor: np.ndarray) -> np.ndarray:
         """Convert one foreign tensor. Raises `ValueError` or `EinopsError` if it does not fit."""
         index, parts = self.part
-        return self._transform.to_jax(np.split(tensor, parts)[index] if parts > 1 else tensor)
+        array = np.split(tensor, parts)[index] if parts > 1 else tensor
+        return rearrange(np.asarray(array), self._pattern)
 
     def to_torch(self, weight: np.ndarray) -> np.ndarray:
         """Convert one weight, or one layer of it, to the foreign tensor or its part."""
-        return self._transform.to_torch(weight)
+        theirs, ours = self._pattern.split("->")
+        return rearrange(np.asarray(weight), f"{ours} -> {theirs}")
 
     @property
-    def _transform(self) -> Transform:
-        return TRANSFORMS.get(self.transform) or _layout(self.transform)
+    def _pattern(self) -> str:
+        return LAYOUTS.get(self.transform, self.transform)
 
 
 def linear_rules(theirs: str, ours: str, part: tuple[int, int] = (0, 1)) -> list[Rule]:
@@ -61,35 +71,18 @@ def linear_rules(theirs: str, ours: str, part: tuple[int, int] = (0, 1)) -> list
     ]
 
 
+def linears_rules(theirs: str, ours: str, names: Mapping[str, str]) -> list[Rule]:
+    """Return the rules of linear layers with biases, by the ends of their names."""
+    return [
+        rule
+        for end, our_end in names.items()
+        for rule in linear_rules(f"{theirs}.{end}", f"{ours}.{our_end}")
+    ]
+
+
 def norm_rules(theirs: str, ours: str) -> list[Rule]:
     """Return the rules of a norm with scale and bias."""
     return [Rule(f"{theirs}.weight", f"{ours}.scale"), Rule(f"{theirs}.bias", f"{ours}.bias")]
-
-
-@dataclass(frozen=True)
-class Transform:
-    """Change of axis layout from a foreign tensor to a weight, and its inverse."""
-
-    to_jax: Callable[[np.ndarray], np.ndarray]
-    to_torch: Callable[[np.ndarray], np.ndarray]
-
-
-def _layout(pattern: str) -> Transform:
-    """Return the transform of an einops pattern, foreign to JAX, without composed axes."""
-    left, right = pattern.split("->")
-    return Transform(
-        lambda x: rearrange(x, pattern),
-        lambda x: rearrange(x, f"{right} -> {left}"),
-    )
-
-
-TRANSFORMS: dict[str, Transform] = {
-    "same": Transform(lambda x: x, lambda x: x),
-    "linear": _layout("o i -> i o"),
-    "conv2d": _layout("o i h w -> h w i o"),
-    "conv3d": _layout("o i t h w -> t h w i o"),
-}
-"""Common changes of axis layout by name."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +93,6 @@ class Leaf:
     names: tuple[str, ...]
     """Foreign tensor names: one or, for stacked blocks, one per layer."""
     shape: tuple[int, ...]
-    """Shape of the weight."""
     dtype: np.dtype
     """Dtype of the foreign tensors; the widest if they have several."""
 

@@ -15,12 +15,11 @@ from pathlib import Path
 
 from egosim_jax.io.bounded import quote, quote_path, read_bytes, read_json
 from egosim_jax.io.mapped import Tensor, read_safetensors
-from egosim_jax.io.untrusted.pth import read_pth
+from egosim_jax.io.untrusted.pth import SUFFIXES, read_pth
 from egosim_jax.types import InputError
 
 INDEX = ".safetensors.index.json"
 SHARD = re.compile(r"(.+)-[0-9]{5}-of-([0-9]{5})")
-PTH = (".pth", ".pt", ".bin", ".ckpt")
 WRAPPER = re.compile(r"(^|(?<=\.))(_orig_mod|_fsdp_wrapped_module|_checkpoint_wrapped_module)\.")
 """Parts that torch's wrappers of modules add to names."""
 TOKENIZER_FILES = (
@@ -39,9 +38,7 @@ class Source:
     name: str
     """File name, or the common part of several."""
     files: tuple[Path, ...]
-    """Files of the tensors."""
     tensors: Mapping[str, Tensor]
-    """Tensors of the checkpoint by name."""
 
     @property
     def path(self) -> Path:
@@ -70,7 +67,7 @@ def sources(path: Path) -> Iterator[Source]:
     if not path.is_dir():
         yield _joined(*_numbered(path))
         return
-    left = {f for f in path.iterdir() if f.suffix in (".safetensors", *PTH) and f.is_file()}
+    left = {f for f in path.iterdir() if f.suffix in (".safetensors", *SUFFIXES) and f.is_file()}
     left = {file for file in left if not file.name.startswith(".")}  # incomplete files
     for index in sorted(path.glob(f"*{INDEX}")):
         source = _of_index(index)

@@ -28,9 +28,7 @@ class Widening:
     """Change of a denoiser's input from a base model's channel layout to its own."""
 
     base: ChannelLayout
-    """Input channels of the base model."""
     layout: ChannelLayout
-    """Input channels of the model."""
     input_layer: str
     """Path of the layer that reads the channels, along the first axis of its kernel."""
 

@@ -31,6 +31,7 @@ from egosim_jax.io.mapped import (
     OURS,
     TensorInfo,
     header,
+    map_ahead,
     read_arrays,
     read_metadata,
     read_safetensors,
@@ -38,7 +39,6 @@ from egosim_jax.io.mapped import (
 from egosim_jax.io.run import write_json
 from egosim_jax.runtime.progress import track_bytes
 from egosim_jax.runtime.terminal import print_line
-from egosim_jax.runtime.threads import map_ahead
 from egosim_jax.types import InputError
 
 THREADS, AHEAD = 2, 3

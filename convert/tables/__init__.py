@@ -43,13 +43,11 @@ class Naming:
     """Names of a network's weights in the checkpoints of one project, and their files."""
 
     rules: Callable[[Any], list[Rule]]
-    """Conversion rules for a network's config."""
     signature: str
     """Key that every checkpoint in this naming has, and no other network."""
     layout: str
     """Layout of checkpoint folders with this naming: a value of `--layout`."""
     stem: str
-    """File name without its extension."""
     folder: str = ""
     """Folder of the file in the layout; empty if all files are side by side."""
     lora_prefix: str | None = None
@@ -65,11 +63,9 @@ class Comparison:
     network: Any
     """Converted network in float32, of the short config."""
     config: Any
-    """Config of the network, shortened."""
     load: Callable[..., Any]
-    """Fill a PyTorch module from the checkpoint; see `reference.Checkpoint.load`."""
+    """Fill a PyTorch module from the checkpoint; see `verify.py`."""
     widening: Widening | None
-    """Change of the input channels in the conversion, or None."""
     make: Callable[[Any], Any]
     """Make the PyTorch module of a config, to be filled by `load`; see `Reference.make`."""
 
@@ -87,12 +83,9 @@ class Comparison:
 class Reference:
     """PyTorch implementation of a network in diffusers or transformers."""
 
-    naming: str
-    """Naming of its parameters."""
     library: str
-    """Library of the class."""
+    """Library of the class, and naming of its parameters."""
     kind: str
-    """Name of the class."""
     arguments: Callable[[Any], dict[str, Any]]
     """Arguments of the class, or of its config, for a network's config."""
     shorten: Callable[[Any], Any] = lambda config: replace(config, dtype="float32")
@@ -123,17 +116,11 @@ class CheckpointNaming:
     """Names of the low-rank tensors in DWM's checkpoints, which have only a LoRA."""
 
     naming: str
-    """Naming of the network's layers."""
     stem: str
-    """File name without its extension."""
     prefix: str = ""
-    """Prefix of the names of layers."""
     separator: str = "."
-    """Separator of the parts of a layer's name."""
     down: str = "lora_A.weight"
-    """Suffix of the down projection."""
     up: str = "lora_B.weight"
-    """Suffix of the up projection."""
     alpha: bool = False
     """True: write alpha, the rank, for each layer."""
 
@@ -157,7 +144,6 @@ class Table:
     """Conversions of one kind of network from and to other projects' checkpoints."""
 
     namings: Mapping[str, Naming]
-    """Namings of checkpoints."""
     ignored: Callable[[Any], list[str]] = lambda config: []
     """Patterns of unused keys, in any naming, for a network's config."""
     reference: Reference | None = None
@@ -243,7 +229,7 @@ def pipeline_files(config: ModelConfig, written: Collection[str]) -> Mapping[str
         if table.reference is None:
             continue
         reference = table.reference
-        folder = table.namings[reference.naming].folder
+        folder = table.namings[reference.library].folder
         present = name in written
         entry = [reference.library, reference.kind] if present else [None, None]
         files["model_index.json"][folder] = entry

@@ -8,9 +8,12 @@ from typing import Any
 import numpy as np
 from einops import rearrange
 
-from egosim_jax.convert.rules import Rule, linear_rules, norm_rules
+from egosim_jax.convert.rules import Rule, linear_rules, linears_rules, norm_rules
 from egosim_jax.convert.tables import SHORT_LAYERS, Comparison, Naming, Reference, Table
 from egosim_jax.models.wan.clip_vision import CLIPVisionConfig
+
+STACKS = ("visual.transformer", "encoder.layers")
+"""Names of the stack of blocks in both namings."""
 
 
 def wan(config: CLIPVisionConfig) -> list[Rule]:
@@ -33,8 +36,7 @@ def wan(config: CLIPVisionConfig) -> list[Rule]:
         ),
         *linear_rules(f"{block}.attn.proj", "blocks.attn.o"),
         *norm_rules(f"{block}.norm2", "blocks.norm2"),
-        *linear_rules(f"{block}.mlp.0", "blocks.up"),
-        *linear_rules(f"{block}.mlp.2", "blocks.down"),
+        *linears_rules(f"{block}.mlp", "blocks", {"0": "up", "2": "down"}),
     ]
 
 
@@ -51,14 +53,9 @@ def transformers(config: CLIPVisionConfig) -> list[Rule]:
         Rule("embeddings.position_embedding.weight", "positions"),
         *norm_rules("pre_layrnorm", "norm"),
         *norm_rules(f"{block}.layer_norm1", "blocks.norm1"),
-        *(
-            rule
-            for theirs, ours in projections.items()
-            for rule in linear_rules(f"{block}.self_attn.{theirs}", f"blocks.attn.{ours}")
-        ),
+        *linears_rules(f"{block}.self_attn", "blocks.attn", projections),
         *norm_rules(f"{block}.layer_norm2", "blocks.norm2"),
-        *linear_rules(f"{block}.mlp.fc1", "blocks.up"),
-        *linear_rules(f"{block}.mlp.fc2", "blocks.down"),
+        *linears_rules(f"{block}.mlp", "blocks", {"fc1": "up", "fc2": "down"}),
     ]
 
 
@@ -66,19 +63,10 @@ def ignored(config: CLIPVisionConfig) -> list[str]:
     """Return the keys of CLIP's text encoder, its projections and the last, unused blocks."""
     unused = range(config.blocks, config.layers)
     return [
-        "log_scale",
-        "logit_scale",
-        "textual.*",
-        "text_model.*",
-        "text_projection.*",
-        "visual.head",
-        "visual_projection.*",
-        "visual.post_norm.*",
-        "post_layernorm.*",
-        "embeddings.position_ids",
-        *(f"visual.transformer.{layer}.*" for layer in unused),
-        *(f"encoder.layers.{layer}.*" for layer in unused),
-    ]
+        "log_scale", "logit_scale", "textual.*", "text_model.*", "text_projection.*", "visual.head",
+        "visual_projection.*", "visual.post_norm.*", "post_layernorm.*", "embeddings.position_ids",
+        *(f"{stack}.{layer}.*" for stack in STACKS for layer in unused),
+    ]  # fmt: skip
 
 
 def arguments(config: CLIPVisionConfig) -> dict[str, Any]:
@@ -136,7 +124,6 @@ TABLE = Table(
     },
     ignored=ignored,
     reference=Reference(
-        naming="transformers",
         library="transformers",
         kind="CLIPVisionModel",
         arguments=arguments,
@@ -145,4 +132,3 @@ TABLE = Table(
         model_type="clip_vision_model",
     ),
 )
-"""Conversions of the CLIP image encoder."""

@@ -10,7 +10,7 @@ import numpy as np
 from einops import rearrange
 
 from egosim_jax.conditioning.layout import COGVIDEOX_INPAINT
-from egosim_jax.convert.rules import Rule, linear_rules, norm_rules
+from egosim_jax.convert.rules import Rule, linear_rules, linears_rules, norm_rules
 from egosim_jax.convert.tables import (
     CheckpointNaming,
     Comparison,
@@ -30,10 +30,9 @@ if TYPE_CHECKING:
 
 TEXT_TOKENS = 226
 """Text tokens of a reference forward."""
+PROJECTIONS = {"to_q": "q", "to_k": "k", "to_v": "v", "to_out.0": "o"}
 SCHEDULER = "CogVideoXDDIMScheduler"
-"""Class of the scheduler in diffusers."""
 PREDICTIONS = {"v": "v_prediction", "epsilon": "epsilon", "x0": "sample"}
-"""Names of the predictions in diffusers."""
 
 
 def diffusers(config: CogVideoXDiTConfig) -> list[Rule]:
@@ -43,19 +42,15 @@ def diffusers(config: CogVideoXDiTConfig) -> list[Rule]:
         Rule("patch_embed.proj.weight", "patch.kernel", "o c i j -> c i j o"),
         Rule("patch_embed.proj.bias", "patch.bias"),
         *linear_rules("patch_embed.text_proj", "text"),
-        *linear_rules("time_embedding.linear_1", "time.up"),
-        *linear_rules("time_embedding.linear_2", "time.down"),
+        *linears_rules("time_embedding", "time", {"linear_1": "up", "linear_2": "down"}),
         *_modulation(f"{theirs}.norm1", "blocks.modulation_a"),
         *_modulation(f"{theirs}.norm2", "blocks.modulation_m"),
-        *linear_rules(f"{theirs}.ff.net.0.proj", "blocks.mlp.up"),
-        *linear_rules(f"{theirs}.ff.net.2", "blocks.mlp.down"),
-        *linear_rules(f"{theirs}.attn1.to_out.0", "blocks.attn.o"),
+        *linears_rules(f"{theirs}.ff.net", "blocks.mlp", {"0.proj": "up", "2": "down"}),
+        *linears_rules(f"{theirs}.attn1", "blocks.attn", PROJECTIONS),
         *norm_rules("norm_final", "norm"),
         *_modulation("norm_out", "modulation"),
         *linear_rules("proj_out", "out"),
     ]
-    for name in "qkv":
-        rules += linear_rules(f"{theirs}.attn1.to_{name}", f"blocks.attn.{name}")
     for name in ("norm_q", "norm_k"):
         rules += norm_rules(f"{theirs}.attn1.{name}", f"blocks.attn.{name}")
     return rules
@@ -173,7 +168,6 @@ TABLE = Table(
         ),
     },
     reference=Reference(
-        naming="diffusers",
         library="diffusers",
         kind="CogVideoXTransformer3DModel",
         arguments=arguments,

@@ -92,11 +92,9 @@ TABLE = Table(
         ),
     },
     reference=Reference(
-        naming="diffusers",
         library="diffusers",
         kind="AutoencoderKLCogVideoX",
         arguments=arguments,
         outputs=partial(vae_outputs, frames=9),
     ),
 )
-"""Conversions of CogVideoX's VAE."""

@@ -19,4 +19,3 @@ TABLE = replace(
         alpha=True,
     ),
 )
-"""Conversions of DWM's transformer on Wan 2.1 Fun InP."""

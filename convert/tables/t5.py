@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from egosim_jax.convert.rules import Rule
-from egosim_jax.convert.tables import Naming, Reference, Table, umt5
+from egosim_jax.convert.tables import Table, umt5
 from egosim_jax.models.t5 import T5Config
 from egosim_jax.types import InputError
 
@@ -30,24 +31,13 @@ def check(tensors: Mapping[str, Tensor]) -> None:
 
 TABLE = Table(
     namings={
-        "transformers": Naming(
+        "transformers": replace(
+            umt5.TABLE.namings["transformers"],
             rules=transformers,
             signature="encoder.block.0.layer.0.SelfAttention.relative_attention_bias.weight",
-            layout="diffusers",
-            folder="text_encoder",
-            stem="model",
         ),
     },
     ignored=umt5.ignored,
     check=check,
-    reference=Reference(
-        naming="transformers",
-        library="transformers",
-        kind="T5EncoderModel",
-        arguments=umt5.arguments,
-        shorten=umt5.shorten,
-        outputs=umt5.outputs,
-        model_type="t5",
-    ),
+    reference=replace(umt5.REFERENCE, kind="T5EncoderModel", model_type="t5"),
 )
-"""Conversions of the T5 encoder."""

@@ -56,16 +56,11 @@ def transformers(config: T5Sizes) -> list[Rule]:
     ]
 
 
-def is_t5(tensors: Mapping[str, Tensor]) -> bool:
-    """Return True for T5, which has a position bias in its first block alone."""
+def check(tensors: Mapping[str, Tensor]) -> None:
+    """Raise `InputError` for T5, which has a position bias in its first block alone."""
     second = "encoder.block.1.layer.0.SelfAttention"
     bias = f"{second}.relative_attention_bias.weight"
-    return f"{second}.q.weight" in tensors and bias not in tensors
-
-
-def check(tensors: Mapping[str, Tensor]) -> None:
-    """Raise `InputError` for T5."""
-    if is_t5(tensors):
+    if f"{second}.q.weight" in tensors and bias not in tensors:
         raise InputError("The text encoder is T5, not umT5. (--config)")
 
 
@@ -116,6 +111,14 @@ def _linears(source: str, target: str, names: dict[str, str]) -> list[Rule]:
     ]
 
 
+REFERENCE = Reference(
+    library="transformers",
+    kind="UMT5EncoderModel",
+    arguments=arguments,
+    shorten=shorten,
+    outputs=outputs,
+    model_type="umt5",
+)
 TABLE = Table(
     namings={
         "wan": Naming(
@@ -134,14 +137,5 @@ TABLE = Table(
     },
     ignored=ignored,
     check=check,
-    reference=Reference(
-        naming="transformers",
-        library="transformers",
-        kind="UMT5EncoderModel",
-        arguments=arguments,
-        shorten=shorten,
-        outputs=outputs,
-        model_type="umt5",
-    ),
+    reference=REFERENCE,
 )
-"""Conversions of the umT5 encoder."""

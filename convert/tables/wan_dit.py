@@ -5,7 +5,7 @@ EgoSim and Wan 2.1 Fun InP have the official names.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from einops import rearrange
 
 from egosim_jax.conditioning.layout import WAN_INPAINT
-from egosim_jax.convert.rules import Rule, linear_rules, norm_rules
+from egosim_jax.convert.rules import Rule, linear_rules, linears_rules, norm_rules
 from egosim_jax.convert.tables import (
     Comparison,
     Naming,
@@ -29,93 +29,78 @@ from egosim_jax.types import InputError
 if TYPE_CHECKING:
     from egosim_jax.configs.model import ModelConfig
 
-PATCH_KERNEL = "o c 1 i j -> c i j o"
 MODULATION = "1 k d -> k d"
 TEXT_TOKENS, IMAGE_TOKENS = 512, 257
 """Numbers of tokens that diffusers' transformer expects: it splits text from image by them."""
 SCHEDULER = "FlowMatchEulerDiscreteScheduler"
-"""Class of the scheduler in diffusers."""
+DIFFUSERS = {
+    "text_embedding.0": "condition_embedder.text_embedder.linear_1",
+    "text_embedding.2": "condition_embedder.text_embedder.linear_2",
+    "time_embedding.0": "condition_embedder.time_embedder.linear_1",
+    "time_embedding.2": "condition_embedder.time_embedder.linear_2",
+    "time_projection.1": "condition_embedder.time_proj",
+    "img_emb.proj.0": "condition_embedder.image_embedder.norm1",
+    "img_emb.proj.1": "condition_embedder.image_embedder.ff.net.0.proj",
+    "img_emb.proj.3": "condition_embedder.image_embedder.ff.net.2",
+    "img_emb.proj.4": "condition_embedder.image_embedder.norm2",
+    "blocks.*.modulation": "blocks.*.scale_shift_table",
+    "blocks.*.norm3": "blocks.*.norm2",
+    "blocks.*.ffn.0": "blocks.*.ffn.net.0.proj",
+    "blocks.*.ffn.2": "blocks.*.ffn.net.2",
+    "head.modulation": "scale_shift_table",
+    "head.head": "proj_out",
+}
+"""Names in diffusers of layers and modulations, by the official names."""
+DIFFUSERS_WORDS = {
+    "self_attn": "attn1", "cross_attn": "attn2", "q": "to_q", "k": "to_k", "v": "to_v",
+    "o": "to_out.0", "k_img": "add_k_proj", "v_img": "add_v_proj", "norm_k_img": "norm_added_k",
+}  # fmt: skip
+"""Parts of the names of attention layers in diffusers, by the official parts."""
 
 
 def wan(config: WanDiTConfig) -> list[Rule]:
     """Return the rules for the official state dict, for any number of input channels."""
     rules = [
-        Rule("patch_embedding.weight", "patch.kernel", PATCH_KERNEL),
+        Rule("patch_embedding.weight", "patch.kernel", "o c 1 i j -> c i j o"),
         Rule("patch_embedding.bias", "patch.bias"),
-        *linear_rules("text_embedding.0", "text.up"),
-        *linear_rules("text_embedding.2", "text.down"),
-        *linear_rules("time_embedding.0", "time.mlp.up"),
-        *linear_rules("time_embedding.2", "time.mlp.down"),
+        *linears_rules("text_embedding", "text", {"0": "up", "2": "down"}),
+        *linears_rules("time_embedding", "time.mlp", {"0": "up", "2": "down"}),
         *linear_rules("time_projection.1", "time.modulation"),
         Rule("blocks.*.modulation", "blocks.modulation", MODULATION),
         *norm_rules("blocks.*.norm3", "blocks.cross_norm"),
-        *linear_rules("blocks.*.ffn.0", "blocks.mlp.up"),
-        *linear_rules("blocks.*.ffn.2", "blocks.mlp.down"),
+        *linears_rules("blocks.*.ffn", "blocks.mlp", {"0": "up", "2": "down"}),
         Rule("head.modulation", "head.modulation", MODULATION),
         *linear_rules("head.head", "head.linear"),
     ]
-    projections = {name: name for name in "qkvo"}
-    for attention in ("self_attn", "cross_attn"):
-        rules += _attention(f"blocks.*.{attention}", f"blocks.{attention}", projections)
+    for name in ("self_attn", "cross_attn"):
+        theirs, ours = f"blocks.*.{name}", f"blocks.{name}"
+        rules += linears_rules(theirs, ours, {projection: projection for projection in "qkvo"})
+        rules += [Rule(f"{theirs}.norm_{x}.weight", f"{ours}.norm_{x}.scale") for x in "qk"]
     if config.image_dim is not None:
-        names = ("img_emb.proj.0", "img_emb.proj.1", "img_emb.proj.3", "img_emb.proj.4")
-        keys = ("k_img", "v_img", "norm_k_img")
-        rules += _image(names, "blocks.*.cross_attn", keys)
+        theirs, ours = "blocks.*.cross_attn", "blocks.cross_attn.image"
+        rules += [
+            *norm_rules("img_emb.proj.0", "image.norm_in"),
+            *linears_rules("img_emb.proj", "image.mlp", {"1": "up", "3": "down"}),
+            *norm_rules("img_emb.proj.4", "image.norm_out"),
+            *linears_rules(theirs, ours, {"k_img": "k", "v_img": "v"}),
+            Rule(f"{theirs}.norm_k_img.weight", f"{ours}.norm_k.scale"),
+        ]
     return rules
 
 
 def diffusers(config: WanDiTConfig) -> list[Rule]:
     """Return the rules for the state dict of diffusers' `WanTransformer3DModel`."""
-    embedder = "condition_embedder"
-    rules = [
-        Rule("patch_embedding.weight", "patch.kernel", PATCH_KERNEL),
-        Rule("patch_embedding.bias", "patch.bias"),
-        *linear_rules(f"{embedder}.text_embedder.linear_1", "text.up"),
-        *linear_rules(f"{embedder}.text_embedder.linear_2", "text.down"),
-        *linear_rules(f"{embedder}.time_embedder.linear_1", "time.mlp.up"),
-        *linear_rules(f"{embedder}.time_embedder.linear_2", "time.mlp.down"),
-        *linear_rules(f"{embedder}.time_proj", "time.modulation"),
-        Rule("blocks.*.scale_shift_table", "blocks.modulation", MODULATION),
-        *norm_rules("blocks.*.norm2", "blocks.cross_norm"),
-        *linear_rules("blocks.*.ffn.net.0.proj", "blocks.mlp.up"),
-        *linear_rules("blocks.*.ffn.net.2", "blocks.mlp.down"),
-        Rule("scale_shift_table", "head.modulation", MODULATION),
-        *linear_rules("proj_out", "head.linear"),
-    ]
-    projections = {"to_q": "q", "to_k": "k", "to_v": "v", "to_out.0": "o"}
-    rules += _attention("blocks.*.attn1", "blocks.self_attn", projections)
-    rules += _attention("blocks.*.attn2", "blocks.cross_attn", projections)
-    if config.image_dim is not None:
-        layers = ("norm1", "ff.net.0.proj", "ff.net.2", "norm2")
-        names = tuple(f"{embedder}.image_embedder.{layer}" for layer in layers)
-        rules += _image(names, "blocks.*.attn2", ("add_k_proj", "add_v_proj", "norm_added_k"))
-    return rules
+    return [replace(rule, source=_in_diffusers(rule.source)) for rule in wan(config)]
 
 
-def _attention(theirs: str, ours: str, projections: Mapping[str, str]) -> list[Rule]:
-    """Return the rules of an attention layer, whose queries and keys have RMS norms."""
-    rules = [
-        rule
-        for name, own in projections.items()
-        for rule in linear_rules(f"{theirs}.{name}", f"{ours}.{own}")
-    ]
-    norms = ("norm_q", "norm_k")
-    return rules + [Rule(f"{theirs}.{name}.weight", f"{ours}.{name}.scale") for name in norms]
-
-
-def _image(embedder: Sequence[str], attention: str, keys: Sequence[str]) -> list[Rule]:
-    """Return the rules of the image embedder's layers, and of its keys and values."""
-    (norm_in, up, down, norm_out), (k, v, norm_k) = embedder, keys
-    ours = "blocks.cross_attn.image"
-    return [
-        *norm_rules(norm_in, "image.norm_in"),
-        *linear_rules(up, "image.mlp.up"),
-        *linear_rules(down, "image.mlp.down"),
-        *norm_rules(norm_out, "image.norm_out"),
-        *linear_rules(f"{attention}.{k}", f"{ours}.k"),
-        *linear_rules(f"{attention}.{v}", f"{ours}.v"),
-        Rule(f"{attention}.{norm_k}.weight", f"{ours}.norm_k.scale"),
-    ]
+def _in_diffusers(name: str) -> str:
+    """Return the name in diffusers of a tensor with an official name."""
+    layer, _, kind = name.rpartition(".")
+    if name in DIFFUSERS:
+        return DIFFUSERS[name]
+    if layer in DIFFUSERS:
+        return f"{DIFFUSERS[layer]}.{kind}"
+    return ".".join(DIFFUSERS_WORDS.get(word, word) for word in name.split("."))
 
 
 def arguments(config: WanDiTConfig) -> dict[str, Any]:
@@ -211,7 +196,6 @@ TABLE = Table(
         ),
     },
     reference=Reference(
-        naming="diffusers",
         library="diffusers",
         kind="WanTransformer3DModel",
         arguments=arguments,

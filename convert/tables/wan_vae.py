@@ -136,11 +136,9 @@ TABLE = Table(
         ),
     },
     reference=Reference(
-        naming="diffusers",
         library="diffusers",
         kind="AutoencoderKLWan",
         arguments=arguments,
         outputs=partial(vae_outputs, frames=5),
     ),
 )
-"""Conversions of the video VAE."""

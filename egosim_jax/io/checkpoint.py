@@ -9,7 +9,6 @@ because Orbax does not notice a changed byte.
 from __future__ import annotations
 
 import errno
-import os
 import shutil
 import sys
 from collections.abc import Awaitable, Iterator, Sequence
@@ -26,6 +25,7 @@ from egosim_jax.io.atomic import TEMPORARY
 from egosim_jax.io.bounded import listing, quote_text, read_json
 from egosim_jax.io.digest import sha256
 from egosim_jax.io.run import write_json
+from egosim_jax.runtime.failures import system_error
 from egosim_jax.runtime.terminal import printable
 from egosim_jax.types import InputError
 
@@ -34,6 +34,8 @@ POSITION = "position.json"
 """File in the folder of the data with the position of its iterator."""
 HASHES = "sha256.json"
 """File in a checkpoint's folder with the hashes of all its other files."""
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+"""System errors of a full disk or quota."""
 
 
 def has_checkpoint(run: Path) -> bool:
@@ -127,8 +129,7 @@ class Checkpoints:
         try:
             yield
         except Exception as error:
-            full = [os.strerror(code) for code in (errno.ENOSPC, errno.EDQUOT)]
-            if not any(reason in str(cause) for cause in _causes(error) for reason in full):
+            if (failure := system_error(error)) is None or failure[0] not in DISK_FULL:
                 raise
             kept = max((kept for kept in self.steps if kept < step), default=None)
             newest = "there is no other" if kept is None else f"the newest is of step {kept}"
@@ -277,12 +278,6 @@ class _Position:
             self.data.set_state(read_json(Path(directory) / POSITION))
 
         return read()
-
-
-def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    while error is not None:
-        yield error
-        error = error.__cause__ or error.__context__
 
 
 def _is_hashes(path: Path) -> bool:

@@ -39,7 +39,6 @@ class Release:
     name: str
     """Name in `egosim models`."""
     about: str
-    """Description of the weights in one line."""
     config: str
     """Name of the config for their conversion."""
     repository: str

@@ -13,20 +13,22 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 from egosim_jax.io.atomic import append_line
-from egosim_jax.io.bounded import quote, read_lines
-from egosim_jax.io.differences import describe
+from egosim_jax.io.bounded import listing, quote, read_lines
 from egosim_jax.io.digest import sha256
+from egosim_jax.runtime.options import option_of
 from egosim_jax.types import InputError
 
 T = TypeVar("T")
 NAME = "journal.jsonl"
 MAX_BYTES = 64 << 20
+_DIGEST = re.compile(r"\b([0-9a-f]{8})[0-9a-f]{24,}\b")
 
 
 class Journal:
@@ -149,6 +151,22 @@ def _chained(chain: str, entry: Any) -> str:
 def digest(path: Path) -> str:
     """Return the SHA-256 of a file, or of the names and hashes of a folder's files."""
     if path.is_dir():
-        listing = [f"{file.name} {digest(file)}\n" for file in sorted(path.iterdir())]
-        return hashlib.sha256("".join(listing).encode()).hexdigest()
+        lines = [f"{file.name} {digest(file)}\n" for file in sorted(path.iterdir())]
+        return hashlib.sha256("".join(lines).encode()).hexdigest()
     return sha256(path)
+
+
+def describe(differing: Mapping[str, tuple[str, str]]) -> str:
+    """Return one line of the values that the folder has and this run has, by dotted path.
+
+    Options of the command come first, by their names on the command line, and digests last, cut
+    to 8 digits. Several fields that follow from one option are one difference.
+    """
+    found: dict[str, tuple[tuple[bool, bool, int], str]] = {}
+    for path, (folder, ours) in differing.items():
+        option, text = option_of(path), f"the folder has {folder}, this run has {ours}"
+        short = _DIGEST.sub(r"\1…", text)
+        name, rank = option or path, (option is None, short != text, len(short))
+        found[name] = min(found.get(name, (rank, short)), (rank, short))
+    ordered = sorted(found.items(), key=lambda item: item[1])
+    return listing([f"{name}: {text}" for name, (_, text) in ordered])

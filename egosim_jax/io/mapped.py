@@ -13,14 +13,15 @@ import json
 import math
 import mmap
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import ml_dtypes
 import numpy as np
@@ -34,9 +35,10 @@ from egosim_jax.io.bounded import (
     quote_path,
     quote_text,
 )
-from egosim_jax.runtime.threads import map_ahead
 from egosim_jax.types import InputError
 
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 CODES = {
     code: np.dtype(kind)
     for code, kind in {
@@ -152,6 +154,23 @@ def read_arrays(tensors: Iterable[Any]) -> Iterator[Any]:
     threads = min(os.cpu_count() or 1, 8)
     array = lambda tensor: tensor.array() if isinstance(tensor, Tensor) else tensor  # noqa: E731
     return map_ahead(array, tensors, threads=threads, ahead=threads)
+
+
+def map_ahead(
+    function: Callable[[Item], Result], items: Iterable[Item], *, threads: int, ahead: int
+) -> Iterator[Result]:
+    """Yield the results of a function in the order of the items.
+
+    At most `ahead` results exist that are not yielded yet.
+    """
+    with ThreadPoolExecutor(threads) as pool:
+        waiting: deque[Future[Result]] = deque()
+        for item in items:
+            if len(waiting) == ahead:
+                yield waiting.popleft().result()
+            waiting.append(pool.submit(function, item))
+        while waiting:
+            yield waiting.popleft().result()
 
 
 def read_metadata(path: Path) -> dict[str, str]:

@@ -42,7 +42,6 @@ class PrivateCache:
     """Cache of files, each with its checksum, in a folder that only its user can write to."""
 
     folder: Path
-    """Folder of the files."""
     most: int
     """Maximum number of files; those that were used last are kept."""
 
@@ -62,8 +61,12 @@ class PrivateCache:
         except OSError as error:
             return _refused(path, str(error.strerror))
         with os.fdopen(descriptor, "rb") as file:
-            if (problem := _file_problem(os.fstat(descriptor))) is not None:
+            about = os.fstat(descriptor)
+            if (problem := _origin_problem(about)) is not None:
                 return _refused(path, problem)
+            if about.st_mode & _OTHERS:
+                mode = stat.S_IMODE(about.st_mode)
+                return _refused(path, f"others may use it (mode {mode:o}, not 600)")
             data = file.read()
             payload = memoryview(data)[_HEAD:]
             if data[:_HEAD] != MAGIC + hashlib.sha256(payload).digest():
@@ -135,15 +138,6 @@ def _forget(folder: Path, most: int) -> None:
 
 def _refused(path: Path, problem: str) -> None:
     warnings.warn(f"{path} is not used but made again: {problem}", stacklevel=3)
-
-
-def _file_problem(found: os.stat_result) -> str | None:
-    """Return the reason not to trust a file of native code; None if it is trusted."""
-    if (problem := _origin_problem(found)) is not None:
-        return problem
-    if found.st_mode & _OTHERS:
-        return f"others may use it (mode {stat.S_IMODE(found.st_mode):o}, not 600)"
-    return None
 
 
 def _origin_problem(found: os.stat_result) -> str | None:

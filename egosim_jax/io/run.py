@@ -17,7 +17,7 @@ import numpy as np
 
 from egosim_jax.io.atomic import atomic_write, hold_folder
 from egosim_jax.io.bounded import MAX_QUOTED, quote, quote_text, read_json
-from egosim_jax.io.differences import describe
+from egosim_jax.io.journal import describe
 from egosim_jax.runtime.terminal import check_utf8
 from egosim_jax.types import InputError
 

@@ -30,6 +30,7 @@ from egosim_jax.io.mapped import (
     read_weights_hash,
 )
 from egosim_jax.io.run import write_json
+from egosim_jax.io.untrusted.pth import SUFFIXES
 from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
@@ -43,7 +44,6 @@ CHUNKS = "chunks"
 RECORD = "hashes.json"
 """Name of the file with the hashes of the networks that a weights folder has from another one."""
 MAX_LISTED = 12
-"""Maximum number of mismatches in an error message."""
 
 
 class WeightsError(InputError):
@@ -244,11 +244,9 @@ def gather(array: Any) -> np.ndarray | None:
     return np.asarray(array) if jax.process_index() == 0 else None
 
 
-def load(
-    path: Path, module: nnx.Module, *, dtype: str | None = None, mesh: Mesh | None = None
-) -> None:
+def load(path: Path, module: nnx.Module, *, mesh: Mesh | None = None) -> None:
     """Fill a module from a file written by `save` or a conversion (see `fill`)."""
-    fill(module, _read(path), dtype=dtype, source=str(path), mesh=mesh)
+    fill(module, _read(path), source=str(path), mesh=mesh)
 
 
 def place(folder: Path, abstract: nnx.State, shardings: nnx.State) -> nnx.State:
@@ -348,7 +346,7 @@ def _absent(path: Path, config: str = "CONFIG") -> InputError:
 def _is_foreign(path: Path) -> bool:
     """Return True for a file of weights in the format of another project."""
     if path.suffix != ".safetensors":
-        return path.suffix in (".pth", ".pt", ".bin", ".ckpt")
+        return path.suffix in SUFFIXES
     try:
         return read_metadata(path).get("format") != OURS
     except InputError:

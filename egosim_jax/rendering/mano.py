@@ -22,7 +22,7 @@ from jaxtyping import Float, Int
 
 from egosim_jax.io.bounded import quote_path
 from egosim_jax.io.untrusted.npz import read_arrays
-from egosim_jax.io.untrusted.pickled_models import read_model
+from egosim_jax.io.untrusted.pickled_arrays import read_model
 from egosim_jax.rendering.mesh import HAND_COLORS, MovingMesh, Side, join_meshes
 from egosim_jax.types import InputError
 

@@ -11,7 +11,7 @@ import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import MISSING, fields, is_dataclass, make_dataclass, replace
+from dataclasses import MISSING, Field, fields, is_dataclass, make_dataclass, replace
 from enum import IntEnum
 from functools import reduce
 from importlib import metadata
@@ -168,25 +168,29 @@ def _refuse_undecoded_places(command: Any) -> None:
                 check_utf8(os.path.realpath(path))
 
 
-def _refuse_empty(command: Any) -> None:
-    """Raise `InputError` for an option that takes several values, and was given without one."""
+def _options(command: Any) -> Iterator[tuple[Any, Field[Any], Any]]:
+    """Yield the fields of a command and of all dataclasses in it: owner, field and value."""
     for field in fields(command):
         value = getattr(command, field.name)
         if is_dataclass(value):
-            _refuse_empty(value)
-        elif value == () and field.default != () and field.default_factory is MISSING:
+            yield from _options(value)
+        else:
+            yield command, field, value
+
+
+def _refuse_empty(command: Any) -> None:
+    """Raise `InputError` for an option that takes several values, and was given without one."""
+    for _, field, value in _options(command):
+        if value == () and field.default != () and field.default_factory is MISSING:
             name = field.name.replace("_", "-")
             raise InputError(f"--{name} has no value: give one or more, or omit it. (--{name})")
 
 
 def _refuse_file(command: Any) -> None:
     """Raise `InputError` if --out, or a folder above it, is a file where a folder has to be."""
-    for field in fields(command):
-        value = getattr(command, field.name)
-        if is_dataclass(value):
-            _refuse_file(value)
-        elif field.name == "out" and isinstance(value, Path):
-            writes: Writes = getattr(command, "writes", "folder")
+    for owner, field, value in _options(command):
+        if field.name == "out" and isinstance(value, Path):
+            writes: Writes = getattr(owner, "writes", "folder")
             may_be_file = writes == "file" or (writes != "folder" and value.suffix == ".zip")
             for path in value.parents if may_be_file else (value, *value.parents):
                 if os.path.exists(path) and not os.path.isdir(path):

@@ -53,8 +53,7 @@ def phase(text: str, *, only_if_long: bool = False) -> Iterator[None]:
     if not only_if_long:
         print(text, file=sys.stderr, flush=True)
     ended = threading.Event()
-    watch = _watch_terminal if sys.stderr.isatty() else _watch_log
-    thread = threading.Thread(target=watch, args=(text, ended), name="phase", daemon=True)
+    thread = threading.Thread(target=_watch, args=(text, ended), name="phase", daemon=True)
     with _Shown.lock:
         _Shown.phases.append(ended)
     thread.start()
@@ -67,25 +66,20 @@ def phase(text: str, *, only_if_long: bool = False) -> Iterator[None]:
             _Shown.phases.remove(ended)
 
 
-def _is_innermost(ended: threading.Event) -> bool:
-    with _Shown.lock:
-        return bool(_Shown.phases) and _Shown.phases[-1] is ended
-
-
-def _watch_log(text: str, ended: threading.Event) -> None:
-    since = time.monotonic()
-    while not ended.wait(PLAIN_SECONDS):
-        if _is_innermost(ended):
+def _watch(text: str, ended: threading.Event) -> None:
+    """Show the time of a phase while it is the innermost one: in a live line, or in a log's."""
+    since, live = time.monotonic(), sys.stderr.isatty()
+    while not ended.wait(LIVE_SECONDS if live else PLAIN_SECONDS):
+        with _Shown.lock:
+            innermost = bool(_Shown.phases) and _Shown.phases[-1] is ended
+        if innermost and live:
+            _show_live(text, since, ended)
+            return
+        if innermost:
             print(f"{text}: {time.monotonic() - since:.0f} s", file=sys.stderr, flush=True)
 
 
-def _watch_terminal(text: str, ended: threading.Event) -> None:
-    since = time.monotonic()
-    while not ended.wait(LIVE_SECONDS):
-        if _is_innermost(ended):
-            break
-    else:
-        return
+def _show_live(text: str, since: float, ended: threading.Event) -> None:
     from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn
 

@@ -7,7 +7,7 @@ and lines are read by `egosim_jax.io.bounded`.
 - hdf5, parquet, colmap: read_hdf5, read_parquet, read_model, each in that child process
 - mjcf: check_files of MuJoCo models, which are compiled in that child process
 - npz: read_arrays of an npz, read_npy
-- pickled, pickled_arrays, pickled_models: interpreter of pickles, NumPy arrays, MANO's models
+- pickled, pickled_arrays: interpreter of pickles; NumPy arrays, and MANO's models
 - zipped: entries of zip archives, bounded by what they expand to
 - pth: tensors of PyTorch's files
 """

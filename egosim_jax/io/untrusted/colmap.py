@@ -29,7 +29,6 @@ MAX_VALUE = 1e12
 """Maximum coordinate or error of a point."""
 PARTS = ("cameras", "images", "points3D")
 MAX_SIDE_PX = 1 << 16
-"""Maximum width and height of an image."""
 
 
 @dataclass(frozen=True, kw_only=True)

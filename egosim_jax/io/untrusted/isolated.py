@@ -69,8 +69,9 @@ class Child:
     def call(self, run: Callable[..., T], *arguments: Any, timeout_s: float) -> T:
         """Return the result of a function that the child can import.
 
-        Raises `TimeoutError` after the time limit, `ChildError` after a crash, and `InputError` or
-        `MemoryError` if the function does. Its other exceptions end the child.
+        Raises `TimeoutError` after the time limit, which it names, or after the processor time,
+        `ChildError` after a crash, and `InputError` or `MemoryError` if the function does. Its
+        other exceptions end the child.
         """
         with self._lock:
             process = self._start()
@@ -81,7 +82,7 @@ class Child:
                     result = pickle.loads(self._connection.recv_bytes(self._max_reply))  # noqa: S301
                 else:
                     self.close()
-                    result = TimeoutError()
+                    result = TimeoutError(f"{timeout_s:g} s")
             except (EOFError, OSError) as error:
                 ending = self._ending(process)
                 if process.returncode == -signal.SIGPROF:  # its processor time is over
@@ -167,10 +168,11 @@ def read_file(
         return _READER.call(
             _limited, max_memory, max_cpu_s, read, path, *arguments, timeout_s=TIMEOUT_S
         )
-    except TimeoutError:
+    except TimeoutError as error:
+        limit = str(error) or f"{max_cpu_s:g} s of processor time"
         raise InputError(
-            f"{name} could not be read within {max_cpu_s:g} s: the library hangs on it. It is "
-            "damaged or too large. Get it again, or split it."
+            f"{name} could not be read within {limit}: the library hangs on it. It is damaged or "
+            "too large. Get it again, or split it."
         ) from None
     except MemoryError:
         _READER.close()

@@ -19,7 +19,6 @@ MAX_ARRAY_BYTES, MAX_PACKED_BYTES = 1 << 34, 1 << 26
 DAMAGE = (ValueError, EOFError, OSError, struct.error)
 """Exceptions for damaged archives and arrays."""
 MAX_ENTRIES = 64
-"""Maximum number of arrays in a file."""
 _HEADER = 4096
 _SIZE = r"(?:0|[1-9][0-9]{0,18})\s*"
 _ITEM = re.compile(

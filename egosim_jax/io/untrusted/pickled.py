@@ -10,12 +10,16 @@ calls of globals would create (`pth.py` for torch, `pickled_arrays.py` for NumPy
 from __future__ import annotations
 
 import pickletools
-from collections.abc import Callable, Mapping
+import struct
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
-from egosim_jax.io.bounded import quote, quote_text
+from egosim_jax.io.bounded import quote, quote_path, quote_text
 from egosim_jax.io.mapped import MAX_TENSORS, RefusedError, check_name
+from egosim_jax.types import InputError
 
 MAX_PICKLE, MAX_STEPS, MAX_DEPTH = 16 << 20, 1 << 20, 64
 """Limits: bytes and operations of the pickle, depth of nested containers."""
@@ -47,7 +51,6 @@ class Interpreter:
     actions: ClassVar[Mapping[str, Callable[[Interpreter, Any], None]]]
     """Method of each supported pickle operation; all others are refused."""
     max_bytes: ClassVar[int] = MAX_PICKLE
-    """Maximum size of a pickle in bytes."""
 
     def __init__(self, program: bytes | memoryview):
         self.program = program
@@ -208,8 +211,17 @@ ACTIONS: dict[str, Callable[[Interpreter, Any], None]] = {
     "REDUCE": Interpreter._call,
     "BUILD": Interpreter._build,
 }  # fmt: skip
-"""Method of each operation that builds plain values."""
 Interpreter.actions = ACTIONS
+
+
+@contextmanager
+def refusing_damage(path: Path, fix: str) -> Iterator[None]:
+    """Turn the exceptions of a damaged or hostile pickle into `InputError`."""
+    try:
+        yield
+    except (ValueError, struct.error, IndexError, TypeError, KeyError) as error:
+        reason = str(error) if isinstance(error, RefusedError) else quote_text(str(error))
+        raise InputError(f"{quote_path(path)} cannot be read: {reason}. {fix}") from error
 
 
 def flatten(tree: Any, kind: type[Leaf]) -> dict[str, Leaf]:

@@ -11,7 +11,6 @@ stays in the memory-mapped file until it is accessed.
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from egosim_jax.io.bounded import quote, quote_path, quote_text
+from egosim_jax.io.bounded import quote, quote_text
 from egosim_jax.io.mapped import (
     CODES,
     MAX_AXES,
@@ -29,10 +28,11 @@ from egosim_jax.io.mapped import (
     map_file,
     strides_of,
 )
-from egosim_jax.io.untrusted.pickled import Interpreter, Name, Opaque, flatten
+from egosim_jax.io.untrusted.pickled import Interpreter, Name, Opaque, flatten, refusing_damage
 from egosim_jax.io.untrusted.zipped import Archive
-from egosim_jax.types import InputError
 
+SUFFIXES = (".pth", ".pt", ".bin", ".ckpt")
+"""Suffixes of files that torch wrote."""
 STORAGES = {
     "DoubleStorage": "float64", "FloatStorage": "float32", "HalfStorage": "float16",
     "BFloat16Storage": "bfloat16", "LongStorage": "int64", "IntStorage": "int32",
@@ -43,6 +43,10 @@ DTYPES = {dtype.name: dtype for dtype in CODES.values()} | {
     name: np.dtype(name) for name in ("float8_e4m3fnuz", "float8_e5m2fnuz")
 }
 """NumPy dtypes by their names in torch."""
+FIX = (
+    "Only tensors in plain containers are supported, as torch.save writes state dicts. Save the "
+    "weights again as such, or better as safetensors."
+)
 UNTYPED = "torch.storage.UntypedStorage"
 
 
@@ -62,15 +66,8 @@ def read_pth(path: Path) -> dict[str, Tensor]:
     a `.pth` archive, is damaged, or holds objects other than tensors, plain values and containers.
     """
     data = map_file(path)
-    try:
+    with refusing_damage(path, FIX):
         return flatten(_Torch(read_entries(data)).run(), Tensor)
-    except (ValueError, struct.error) as error:
-        reason = str(error) if isinstance(error, RefusedError) else quote_text(str(error))
-        raise InputError(
-            f"{quote_path(path)} cannot be read: {reason}. Only tensors in plain containers are "
-            "supported, as torch.save writes state dicts. Save the weights again as such, or "
-            "better as safetensors."
-        ) from error
 
 
 def read_entries(data: memoryview) -> dict[str, memoryview]:

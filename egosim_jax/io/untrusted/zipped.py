@@ -19,7 +19,6 @@ from typing import NamedTuple
 from egosim_jax.io.bounded import open_regular, quote
 
 MAX_ENTRIES = 1 << 17
-"""Maximum number of entries in an archive."""
 MAX_UNPACKED_BYTES = 1 << 28
 """Maximum size of a compressed entry in bytes, unpacked."""
 END, END64_LOCATOR = struct.Struct("<10xH4xI2x"), struct.Struct("<8xQ4x")
@@ -38,7 +37,6 @@ class Entry(NamedTuple):
 
     name: str
     begin: int
-    """Byte offset of the content."""
     packed: int
     """Bytes of the content in the archive."""
     size: int

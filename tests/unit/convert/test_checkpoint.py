@@ -142,19 +142,6 @@ def test_half_precision_is_added_as_the_same_values_in_float32(half, tmp_path):
             np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
-def test_the_command_writes_the_folder(dtype, tiny, tmp_path):
-    want = released("cogvideox", tmp_path / "checkpoint", dtype)
-    command = f"lora {tmp_path / 'checkpoint'} --config dwm_cogvideox_5b --layout dwm"
-    assert main([*command.split(), "--out", str(tmp_path / "again")]) == 0
-    for stem, tensors in want.items():
-        have = read_safetensors(tmp_path / "again" / f"{stem}.safetensors")
-        assert have.keys() == tensors.keys()
-        for name, tensor in tensors.items():
-            assert have[name].dtype == tensor.dtype
-            assert have[name].array().tobytes() == tensor.tobytes(), name
-
-
 def test_a_transformer_that_was_saved_with_its_lora_is_read_without_it(tiny, tmp_path, capsys):
     """As in the final folder of a training of DWM: PEFT renames the adapted layers."""
     rng = np.random.default_rng(0)
@@ -172,15 +159,7 @@ def test_a_transformer_that_was_saved_with_its_lora_is_read_without_it(tiny, tmp
     folder.mkdir(parents=True)
     file = folder / "diffusion_pytorch_model.safetensors"
     save_file({name: jnp.asarray(tensor) for name, tensor in adapted.items()}, file)
-    command = [
-        "weights",
-        str(tmp_path / "final"),
-        "--config",
-        "dwm_cogvideox_5b",
-        "--only",
-        "dit",
-        "--out",
-    ]
+    command = f"weights {tmp_path / 'final'} --config dwm_cogvideox_5b --only dit --out".split()
     assert main([*command, str(tmp_path / "out")]) == 0
     assert "skipped 16 tensors of a LoRA" in capsys.readouterr().err
     have = read_safetensors(tmp_path / "out" / "dit.safetensors")
@@ -224,21 +203,17 @@ def test_a_full_size_checkpoint_has_the_layers_of_the_release(name, modules, wei
     assert shapes["patch.kernel"] == patch
 
 
-def test_a_difference_needs_the_weights_it_is_from():
-    changes = {"patch.bias": np.ones(32, np.float32)}
-    with pytest.raises(InputError, match=r"give these weights\. \(--base\)"):
-        checkpoint(changes, COGVIDEOX, None)
-
-
-def test_weights_in_the_blocks_have_no_name_in_a_checkpoint():
-    changes = {"blocks.attn.q.bias": np.ones((LAYERS, 32), np.float32)}
-    with pytest.raises(InputError, match="only outside the blocks"):
-        checkpoint(changes, COGVIDEOX, {})
-
-
-def test_other_models_have_no_such_checkpoints():
-    with pytest.raises(InputError, match=r"only the models dwm_\*"):
-        checkpoint({}, configs.get("debug").dit, None)
+@pytest.mark.parametrize(
+    ("path", "shape", "base", "config", "reason"),
+    [
+        ("patch.bias", 32, None, COGVIDEOX, r"give these weights\. \(--base\)"),
+        ("blocks.attn.q.bias", (LAYERS, 32), {}, COGVIDEOX, "only outside the blocks"),
+        ("patch.bias", 32, None, configs.get("debug").dit, r"only the models dwm_\*"),
+    ],
+)
+def test_changes_that_a_checkpoint_cannot_have_are_refused(path, shape, base, config, reason):
+    with pytest.raises(InputError, match=reason):
+        checkpoint({path: np.ones(shape, np.float32)}, config, base)
 
 
 def test_a_file_without_its_weights_in_full_is_refused(tiny, tmp_path, capsys):

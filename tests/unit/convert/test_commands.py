@@ -1,11 +1,10 @@
 """`egosim-convert`: released checkpoints to weights folders."""
 
 import dataclasses
-import json
 import math
 import re
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 import pytest
@@ -23,37 +22,11 @@ from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.detect import detect
 from egosim_jax.convert.tables import table_of
 from egosim_jax.diffusion import DDIM, RectifiedFlow, VariancePreserving
-from egosim_jax.io.weights import flat_shapes
 from egosim_jax.types import InputError
 from tests.translation import translate_back
+from tests.unit.convert.made import CONFIG, foreign, prefixed, sharded
 
-CONFIG = configs.get("debug")
 NETWORKS = ("dit", "vae", "text", "image")
-
-
-@cache
-def all_shapes() -> dict[str, dict[str, tuple[int, ...]]]:
-    parts = Networks.abstract(CONFIG).parts()
-    return {network: flat_shapes(part) for network, part in parts.items()}
-
-
-def foreign(network, naming, dtype=torch.float32) -> dict[str, torch.Tensor]:
-    """A network of `debug` with random weights, in foreign names."""
-    rng = np.random.default_rng(NETWORKS.index(network))
-    ours = {
-        path: rng.normal(size=shape).astype(np.float32)
-        for path, shape in all_shapes()[network].items()
-    }
-    config = CONFIG.networks[network]
-    theirs = translate_back(ours, table_of(config).rules(naming, config))
-    return {
-        name: torch.from_numpy(np.ascontiguousarray(tensor)).to(dtype)
-        for name, tensor in theirs.items()
-    }
-
-
-def prefixed(tensors, prefix):
-    return {prefix + name: tensor for name, tensor in tensors.items()}
 
 
 def egosim(folder):
@@ -63,19 +36,6 @@ def egosim(folder):
     torch.save(text, folder / "models_t5_umt5-xxl-enc-bf16.pth")
     clip = foreign("image", "wan") | {"log_scale": torch.rand(()), "textual.a": torch.rand(2)}
     torch.save(clip, folder / "models_clip_open-clip-xlm-roberta-large-vit-huge-14.pth")
-
-
-def sharded(folder, tensors, stem, shards=3):
-    """Sharded with an index, like the Wan releases."""
-    names = sorted(tensors)
-    places = {
-        name: f"{stem}-{1 + number % shards:05d}-of-{shards:05d}.safetensors"
-        for number, name in enumerate(names)
-    }
-    for place in set(places.values()):
-        save_file({n: tensors[n] for n in names if places[n] == place}, folder / place)
-    index = folder / f"{stem}.safetensors.index.json"
-    index.write_text(json.dumps({"metadata": {}, "weight_map": places}), encoding="utf-8")
 
 
 def wan(folder):
@@ -169,7 +129,7 @@ def test_what_does_not_fit_is_one_list_and_nothing_is_written(tmp_path, capsys):
 
 def test_weights_are_stored_as_asked_and_half_precision_as_it_is(tmp_path):
     (source := tmp_path / "theirs").mkdir()
-    save_file(foreign("dit", "wan", torch.bfloat16), source / "dit.safetensors")
+    save_file(foreign("dit", "wan", dtype=torch.bfloat16), source / "dit.safetensors")
     assert convert(source, tmp_path / "same", "--only", "dit") == 0
     assert convert(source, tmp_path / "wide", "--dtype", "float32", "--only", "dit") == 0
     same, wide = (load_flax(tmp_path / name / "dit.safetensors") for name in ("same", "wide"))
@@ -298,22 +258,6 @@ def test_a_file_of_another_plan_is_not_continued(tmp_path, monkeypatch, other):
 
 def back(weights, out, *more):
     return main(["to-torch", str(weights), "--config", "debug", "--out", str(out), *more])
-
-
-def test_folders_of_the_encoders_alone_are_converted_and_written_back(tmp_path):
-    for network, folder in (("text", "umt5"), ("image", "clip")):
-        (tmp_path / "theirs" / folder).mkdir(parents=True)
-        sharded(tmp_path / "theirs" / folder, foreign(network, "transformers"), "model", 2)
-    assert convert(tmp_path / "theirs", tmp_path / "ours", "--only", "text", "image") == 0
-    args = ["--config", "debug"]
-    assert main(["verify", str(tmp_path / "theirs"), str(tmp_path / "ours"), *args]) == 0
-    only = ["--layout", "diffusers", "--only", "text", "image"]
-    assert back(tmp_path / "ours", tmp_path / "back", *only) == 0
-    for network in ("text", "image"):
-        tensors = detect(tmp_path / "back").network(network).tensors
-        expected = foreign(network, "transformers")
-        assert tensors.keys() == expected.keys()
-        assert all(np.array_equal(t.array(), expected[n].numpy()) for n, t in tensors.items())
 
 
 @pytest.mark.parametrize("layout", ["wan", "diffusers"])

@@ -13,8 +13,7 @@ from egosim_jax.io import weights
 from egosim_jax.io.mapped import read_safetensors
 from egosim_jax.models import abstract, lora
 from egosim_jax.types import InputError
-from tests.unit.convert.made import CONFIG, DIM, LAYER, NAME, arrays, one_line, pair, save
-from tests.unit.convert.test_prefixes import foreign
+from tests.unit.convert.made import CONFIG, DIM, LAYER, NAME, arrays, foreign, one_line, pair, save
 
 THEIRS = "blocks.1.self_attn.k.weight"
 
@@ -70,15 +69,6 @@ def test_weights_names_a_value_that_a_dtype_cannot_hold(
     assert main([str(arg) for arg in args]) == 0
     have = read_safetensors(tmp_path / "out" / "dit.safetensors")
     assert all(all_finite(tensor.array()) for tensor in have.values())
-
-
-@pytest.mark.parametrize(("value", "to"), [(np.nan, None), (1e5, "float16"), (np.inf, "bfloat16")])
-def test_an_export_names_them_too(value, to, tmp_path, capsys):
-    args = ["to-torch", base(tmp_path, value), "--config", "debug", "--only", "dit"]
-    args += ["--out", tmp_path / "out", *(["--dtype", to] if to else [])]
-    said = one_line(capsys, 2, *args)
-    assert "blocks.1.self_attn.q.weight has " in said
-    assert not list((tmp_path / "out").glob("[!.]*"))
 
 
 HUGE = {

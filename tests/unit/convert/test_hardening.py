@@ -1,6 +1,5 @@
 """Damaged or hostile files: refused in one line, with little time and memory."""
 
-import contextlib
 import json
 import os
 import pickle
@@ -70,31 +69,17 @@ def pickled(path, program):
 
 WHOLE = entry(shape=(6,), places=(0, 6))
 HEADERS = {
-    "a list": [],
     "no JSON": b"{,}",
-    "a dtype alone": {"a": {"dtype": "U8"}},
-    "three offsets": {"a": entry(places=(0, 1, 6))},
-    "offsets that go back": {"a": entry(places=(6, 0))},
-    "a negative axis": {"a": entry(shape=(-6,), places=(0, 6))},
-    "an axis of 6.0": {"a": entry(shape=(6.0,), places=(0, 6))},
     "a place outside the file": {"a": entry(shape=(8,), places=(0, 8))},
-    "a place of another size": {"a": entry(shape=(3,), places=(0, 6))},
-    "a dtype that is a list": {"a": {**entry(), "dtype": []}},
     "a dtype of four bits": {"a": entry("F4", shape=(12,), places=(0, 6))},
     "lists in lists": b'{"a":' + 50_000 * b"[" + 50_000 * b"]" + b"}",
     "half a surrogate pair": b'{"a\\ud800": ' + json.dumps(WHOLE).encode() + b"}",
     "a name of 600 characters": {600 * "a": WHOLE},
     "a name with a line feed": {"a\nb": WHOLE},
-    "metadata that is no text": {"__metadata__": {"a": 1}, "a": WHOLE},
-    "one place twice": {"a": entry(), "b": entry()},
     "places that overlap": {"a": entry(), "b": entry(places=(2, 6))},
-    "a hole before the first": {"a": entry(shape=(5,), places=(1, 6))},
     "a hole between": {"a": entry(), "b": entry(shape=(1,), places=(5, 6))},
     "bytes after the last": {"a": entry()},
     "40 axes": {"a": entry(shape=(1,) * 39 + (6,), places=(0, 6))},
-    "an axis of 4,000 digits": (
-        b'{"a": {"dtype": "U8", "shape": [0, 1%s], "data_offsets": [0, 0]}}' % (4000 * b"0")
-    ),
     "an empty tensor without end": {
         "a": entry(shape=(0, 2**40, 2**20), places=(0, 0)), "b": WHOLE,
     },
@@ -241,20 +226,6 @@ def test_a_zip_of_five_million_entries_is_refused(tmp_path):
     assert "directory is damaged" in refused(read_pth, path)
 
 
-@pytest.mark.parametrize("where", [b"PK\1\2", b"PK\5\6", b"PK\6\6", b"PK\6\7", b"PK\3\4"])
-def test_a_damaged_zip_is_refused_or_read(tmp_path, where):
-    path = tmp_path / "x.pth"
-    torch.save({"w": torch.rand(2)}, path)
-    whole = path.read_bytes()
-    at = whole.index(where)
-    for byte in range(0, 40, 3):
-        data = bytearray(whole)
-        data[(at + byte) % len(data)] ^= 0xFF
-        path.write_bytes(data)
-        with contextlib.suppress(InputError):
-            read_pth(path)
-
-
 def test_an_optimizer_state_next_to_the_weights_is_read(tmp_path):
     network = torch.nn.Linear(2, 2)
     optimizer = torch.optim.Adam(network.parameters())
@@ -264,7 +235,7 @@ def test_an_optimizer_state_next_to_the_weights_is_read(tmp_path):
     assert "o.state.0.exp_avg" in read_pth(tmp_path / "x.pth")
 
 
-# Flipped bytes.
+# Files of ours.
 
 
 def hashed(path):
@@ -281,24 +252,6 @@ def test_what_we_write_is_read_by_others_and_us(tmp_path):
         np.testing.assert_array_equal(theirs[name], array)
         np.testing.assert_array_equal(ours[name].array(), array)
     assert weights.hashes(tmp_path)["x"] == read_metadata(path)["sha256"]
-
-
-def test_every_flipped_byte_is_noticed_or_changes_nothing(tmp_path):
-    arrays = hashed(path := tmp_path / "x.safetensors")
-    whole = path.read_bytes()
-    noticed = 0
-    for place in range(len(whole)):
-        data = bytearray(whole)
-        data[place] ^= 1 << place % 8
-        path.write_bytes(data)
-        try:
-            found = {name: tensor.array() for name, tensor in read_safetensors(path).items()}
-        except InputError:
-            noticed += 1
-        else:
-            assert found.keys() == arrays.keys()
-            assert all(np.array_equal(found[name], arrays[name]) for name in found)
-    assert noticed > 0.9 * len(whole)
 
 
 def test_only_the_tensor_that_is_asked_for_is_checked(tmp_path):

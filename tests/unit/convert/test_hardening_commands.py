@@ -1,6 +1,5 @@
 """Inputs that `egosim-convert` refuses, and the outputs that other projects load."""
 
-import errno
 import os
 import subprocess
 import sys
@@ -15,19 +14,11 @@ from safetensors.numpy import load_file
 from transformers import CLIPVisionModel, UMT5EncoderModel
 
 from egosim_jax import configs
-from egosim_jax.convert import writer
 from egosim_jax.convert.__main__ import main
 from egosim_jax.io import weights
 from egosim_jax.io.mapped import read_metadata
 from egosim_jax.types import InputError
-from tests.unit.convert.made import (
-    CONFIG,
-    one_line,
-    ours,
-    pair,
-    save,
-    theirs,
-)
+from tests.unit.convert.made import CONFIG, one_line, ours, pair, save, theirs
 
 
 @pytest.fixture
@@ -55,27 +46,26 @@ def test_a_tokenizer_is_copied_without_what_is_not_of_it(tokenized, tmp_path):
     assert files == {"text.safetensors", "umt5-xxl", "umt5-xxl/tokenizer.json"}
 
 
-@pytest.mark.parametrize("to", ["/etc/passwd", "nowhere", "tokenizer_config.json"])
-def test_a_link_in_a_tokenizer_is_refused_before_anything_is_written(
-    tokenized, tmp_path, capsys, to
+def link_folder(folder):
+    folder.symlink_to(folder.rename(folder.parents[2] / "elsewhere"))
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda folder: (folder / "tokenizer_config.json").symlink_to("/etc/passwd"), "a symlink"),
+        (lambda folder: (folder / "tokenizer_config.json").symlink_to("nowhere"), "a symlink"),
+        (link_folder, "a symlink"),
+        (lambda folder: os.truncate(folder / "tokenizer.json", 1 << 32), "more than 67,108,864"),
+    ],
+)
+def test_a_tokenizer_of_links_or_large_files_is_refused_before_anything_is_written(
+    tokenized, tmp_path, capsys, change, reason
 ):
     source, folder = tokenized
-    (folder / "tokenizer_config.json").symlink_to(to)
-    assert "is a symlink" in one_line(capsys, 2, *convert(source, tmp_path / "out"))
+    change(folder)
+    assert reason in one_line(capsys, 2, *convert(source, tmp_path / "out"))
     assert not (tmp_path / "out").exists()
-
-
-def test_a_linked_tokenizer_folder_is_refused(tokenized, tmp_path, capsys):
-    source, folder = tokenized
-    folder.rename(tmp_path / "elsewhere")
-    folder.symlink_to(tmp_path / "elsewhere")
-    assert "is a symlink" in one_line(capsys, 2, *convert(source, tmp_path / "out"))
-
-
-def test_a_huge_tokenizer_is_refused(tokenized, tmp_path, capsys):
-    source, folder = tokenized
-    os.truncate(folder / "tokenizer.json", 1 << 32)
-    assert "more than 67,108,864 bytes" in one_line(capsys, 2, *convert(source, tmp_path / "out"))
 
 
 def test_what_is_written_is_apart_from_what_is_read(tmp_path, capsys):
@@ -115,49 +105,21 @@ def test_diffusers_and_transformers_load_what_is_written_for_them(tmp_path, monk
     assert pipeline.scheduler.config.shift == CONFIG.process.shift
 
 
-# What the system refuses.
-
-
-def commands(tmp_path):
-    source, base = theirs(tmp_path), ours(tmp_path / "base", "text", "dit")
-    file = save(tmp_path / "x.safetensors", pair())
-    return {
-        "weights": ["weights", source, "--config", "debug", "--only", "text"],
-        "lora": ["lora", file, "--config", "debug"],
-        "merge": ["lora", file, "--config", "debug", "--merge", base],
-        "to-torch": ["to-torch", base, "--config", "debug", "--only", "text"],
-    }
-
-
-@pytest.mark.parametrize("name", ["weights", "merge"])
-def test_a_full_disk_is_one_line(tmp_path, capsys, monkeypatch, name):
-    args = commands(tmp_path)[name]
-
-    def full(*_):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    with monkeypatch.context() as patch:
-        patch.setattr(writer.os, "fsync", full)
-        out = tmp_path / "out" / "x.safetensors"
-        assert "No space left" in one_line(capsys, 1, *args, "--out", out)
-    assert not [path for path in tmp_path.glob("out/**/*.safetensors") if path.is_file()]
-    assert main([str(arg) for arg in [*args, "--out", out]]) == 0
-
-
 @pytest.mark.parametrize("name", ["lora", "to-torch"])
 def test_a_second_process_is_one_line(tmp_path, capsys, name):
-    args, out = commands(tmp_path)[name], tmp_path / "out"
-    held = out if name != "lora" else tmp_path
+    source = save(tmp_path / "x.safetensors", pair())
+    if name == "to-torch":
+        source = ours(tmp_path / "base", *CONFIG.networks)
     code = (
         "import sys, pathlib; from egosim_jax.io.atomic import hold_folder;"
         "hold_folder(pathlib.Path(sys.argv[1])); print(flush=True); input()"
     )
-    pipe = subprocess.PIPE
-    with subprocess.Popen(
-        [sys.executable, "-c", code, str(held)], stdin=pipe, stdout=pipe
-    ) as other:
+    held, pipe = tmp_path / "held", subprocess.PIPE
+    out = held / "out" if name == "lora" else held
+    with subprocess.Popen([sys.executable, "-c", code, held], stdin=pipe, stdout=pipe) as other:
         other.stdout.readline()
-        assert "another process" in one_line(capsys, 2, *args, "--out", out)
+        args = [name, source, "--config", "debug", "--out", out]
+        assert "another process" in one_line(capsys, 2, *args)
         other.communicate(b"\n")
 
 

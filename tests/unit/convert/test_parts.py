@@ -1,7 +1,5 @@
 """Folders of a part of the networks, stacks of several dtypes, T5, and hashes of weights."""
 
-import json
-
 import numpy as np
 import pytest
 import torch
@@ -12,12 +10,11 @@ from egosim_jax import configs
 from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.detect import detect
 from egosim_jax.convert.plan import fits
-from egosim_jax.convert.tables import table_of
+from egosim_jax.convert.tables import table_of, weight_shapes
 from egosim_jax.io import weights
 from egosim_jax.io.mapped import read_safetensors
 from tests.translation import translate_back
-from tests.unit.convert.made import CONFIG, arrays, one_line, ours
-from tests.unit.convert.test_prefixes import foreign
+from tests.unit.convert.made import CONFIG, arrays, foreign, one_line, ours, sharded
 
 ALL = ("dit", "vae", "text", "image")
 
@@ -96,7 +93,8 @@ def test_inspect_distinguishes_t5_and_umt5(name, prefix, tmp_path, capsys):
     """They have the same names, but T5 has a position bias in its first block alone."""
     config = configs.get(name).text
     rng = np.random.default_rng(0)
-    values = {path: rng.normal(size=s).astype(np.float32) for path, s in shapes(config).items()}
+    shapes = weight_shapes(config)
+    values = {path: rng.normal(size=s).astype(np.float32) for path, s in shapes.items()}
     theirs = translate_back(values, table_of(config).rules("transformers", config))
     tensors = {f"{prefix}{key}": np.ascontiguousarray(array) for key, array in theirs.items()}
     save_numpy(tensors, tmp_path / "model.safetensors")
@@ -105,12 +103,6 @@ def test_inspect_distinguishes_t5_and_umt5(name, prefix, tmp_path, capsys):
     assert name in row
     (found,) = detect(tmp_path / "model.safetensors", configs.get("dwm_tabletop")).found
     assert found.table is table_of(config)
-
-
-def shapes(config):
-    from egosim_jax.convert.tables import weight_shapes
-
-    return weight_shapes(config)
 
 
 @pytest.mark.parametrize("network", ["dit", "image"])
@@ -156,14 +148,7 @@ def test_other_weights_have_another_hash(change, tmp_path):
 
 
 def test_the_index_of_a_checkpoint_is_its_path(tmp_path):
-    tensors = list(foreign("vae").items())
-    weight_map = {}
-    for number, part in enumerate((dict(tensors[::2]), dict(tensors[1::2])), 1):
-        file = f"vae-{number:05d}-of-00002.safetensors"
-        save_file(part, tmp_path / file)
-        weight_map |= dict.fromkeys(part, file)
-    index = tmp_path / "vae.safetensors.index.json"
-    index.write_text(json.dumps({"weight_map": weight_map}), encoding="utf-8")
+    index = sharded(tmp_path, foreign("vae"), "vae", 2)
     (found,) = detect(index).found
     assert found.tensors.keys() == foreign("vae").keys()
     assert found.source.path == index

@@ -8,24 +8,21 @@ from safetensors.torch import save_file
 from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.detect import detect
 from egosim_jax.convert.lora import read_lora
-from egosim_jax.convert.tables import table_of
 from egosim_jax.io.mapped import read_safetensors
 from egosim_jax.types import InputError
-from tests.translation import translate_back
-from tests.unit.convert.made import CONFIG, DIM, LAYER, arrays, one_line, pair, save
+from tests.unit.convert.made import (
+    CONFIG,
+    DIM,
+    LAYER,
+    arrays,
+    foreign,
+    one_line,
+    pair,
+    prefixed,
+    save,
+)  # fmt: skip
 
 LAYER_NAME = "blocks.0.self_attn.q"
-
-
-def foreign(network="dit", naming="wan", add=0.0):
-    rules = table_of(CONFIG.networks[network]).rules(naming, CONFIG.networks[network])
-    ours = {path: array + np.float32(add) for path, array in arrays(network).items()}
-    theirs = translate_back(ours, rules)
-    return {name: torch.from_numpy(np.ascontiguousarray(a)) for name, a in theirs.items()}
-
-
-def prefixed(tensors, prefix):
-    return {f"{prefix}{name}": tensor for name, tensor in tensors.items()}
 
 
 def compiled(tensors, infix="_orig_mod"):
@@ -149,9 +146,8 @@ def test_of_two_checkpoints_in_a_file_one_is_chosen(first, second, chosen, tmp_p
         have = read_safetensors(out / "dit.safetensors")
         for path, array in arrays("dit").items():
             np.testing.assert_array_equal(have[path].array(), array + np.float32(add))
-    assert "no network after 'student'" in one_line(
-        capsys, 2, *args, tmp_path / "none", "--prefix", "student"
-    )
+    args += [tmp_path / "none", "--prefix", "student"]
+    assert "no network after 'student'" in one_line(capsys, 2, *args)
 
 
 @pytest.mark.parametrize(("first", "second", "chosen"), TWINS[1:3])

@@ -14,11 +14,10 @@ from egosim_jax import configs
 from egosim_jax.conditioning.layout import ChannelLayout
 from egosim_jax.convert.__main__ import main
 from egosim_jax.convert.detect import detect
-from egosim_jax.convert.lora import read_lora
 from egosim_jax.convert.rules import Rule
 from egosim_jax.convert.tables import Naming, Table, weight_shapes
 from egosim_jax.io import weights
-from egosim_jax.models import abstract, lora
+from egosim_jax.models import abstract
 from egosim_jax.models.layers import Linear, stack
 from tests.translation import translate_back
 
@@ -174,21 +173,3 @@ def test_a_lora_is_read_merged_and_written_in_the_naming_of_the_table(tmp_path):
     np.testing.assert_allclose(
         after["reader.kernel"], before["reader.kernel"] + tensors["mixer.in_proj.diff"].T, atol=1e-6
     )
-
-
-def test_a_lora_with_weights_trained_in_full_is_exported(tmp_path):
-    rng = np.random.default_rng(3)
-    down, up = (rng.normal(size=shape).astype(np.float32) for shape in ((2, 8, 3), (2, 3, 8)))
-    changes = {
-        "blocks": lora.Delta(down=down, up=up),
-        "reader.kernel": rng.normal(size=(49, 8)).astype(np.float32),
-    }
-    metadata = lora.metadata("mixer", base="0")
-    weights.write(tmp_path / "ours.safetensors", lora.tensors(changes), metadata=metadata)
-    out = tmp_path / "out" / "lora.safetensors"
-    assert run("lora", tmp_path / "ours.safetensors", "--config", "mixer", "--out", out) == 0
-    written = load_file(out)
-    np.testing.assert_array_equal(written["mixer.in_proj.diff"], changes["reader.kernel"].T)
-    again = read_lora(out, CONFIG)
-    np.testing.assert_array_equal(again["blocks"].up, up)
-    np.testing.assert_array_equal(again["reader.kernel"], changes["reader.kernel"])

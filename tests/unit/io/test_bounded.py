@@ -11,6 +11,7 @@ import pytest
 from egosim_jax.io.bounded import (
     MAX_QUOTED,
     check_version,
+    named,
     only_inside,
     open_regular,
     parse_json,
@@ -20,6 +21,7 @@ from egosim_jax.io.bounded import (
     read_bytes,
     read_json,
     read_lines,
+    unlike,
 )
 from egosim_jax.types import InputError
 
@@ -175,3 +177,33 @@ def test_another_version_of_a_format_is_refused_with_the_fix(version):
     with pytest.raises(InputError, match=r"^state\.json has version .* reads version 1\. Make it"):
         check_version(version, 1, source="state.json")
     check_version(1, 1, source="state.json")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "shown"),
+    [
+        ("a.ply", "a.ply cannot be read: it is empty.", "a.ply cannot be read: it is empty."),
+        ("a.ply", "no colors.", "a.ply: no colors."),
+        ("shard-0 record 3", "shard-0 record 3 is damaged", "shard-0 record 3 is damaged"),
+        ("b", "a.ply cannot be read", "b: a.ply cannot be read"),
+    ],
+)
+def test_a_file_is_named_once(name, text, shown):
+    assert named(name, InputError(text)) == shown
+
+
+@pytest.mark.parametrize(
+    ("value", "limit", "shown"),
+    [
+        (49.7, 50.0, "49.7"),
+        (49.97, 50.0, "49.97"),
+        (115.00004, 115.0, "115.00004"),
+        (79.6, 80.0, "79.6"),
+        (12.3456, 50.0, "12.3"),
+        (0.0, 1.0, "0"),
+        (float("nan"), 1.0, "nan"),
+        (50.0, 50.0, "50.0"),
+    ],
+)
+def test_a_number_is_never_shown_as_the_limit_that_it_breaks(value, limit, shown):
+    assert unlike(value, limit) == shown

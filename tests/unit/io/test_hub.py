@@ -50,6 +50,9 @@ def test_only_the_files_of_the_release_are_downloaded_and_their_hashes_recorded(
     record = read_json(hub.record_path(RELEASE.name))
     assert record["revision"] == COMMIT
     assert record["files"]["tokenizer/tokenizer.json"] == hashlib.sha256(b"{}").hexdigest()
+    served.requests.clear()
+    fetch(RELEASE, tmp_path / "here")
+    assert not [path for method, path, _ in served.requests if "resolve" in path]
 
 
 def test_a_download_that_was_cut_off_continues_after_its_bytes(served, tmp_path):
@@ -57,13 +60,6 @@ def test_a_download_that_was_cut_off_continues_after_its_bytes(served, tmp_path)
     fetch(RELEASE, tmp_path / "here")
     ranges = [r for method, path, r in served.requests if "weights.bin" in path and r]
     assert ranges == ["bytes=1500000-"]
-
-
-def test_a_second_fetch_downloads_nothing(served, tmp_path):
-    fetch(RELEASE, tmp_path / "here")
-    served.requests.clear()
-    fetch(RELEASE, tmp_path / "here")
-    assert not [path for method, path, _ in served.requests if "resolve" in path]
 
 
 def test_a_damaged_file_is_removed_and_named(served, tmp_path):
@@ -78,12 +74,6 @@ def test_a_damaged_file_is_removed_and_named(served, tmp_path):
     assert not path.exists()
     hub.download(release, tmp_path / "here")
     assert path.read_bytes() == (served.folder / "weights.bin").read_bytes()
-
-
-def test_a_hash_of_the_release_is_binding(served):
-    release = replace(RELEASE, files={"weights.bin": "0" * 64})
-    with pytest.raises(InputError, match=f"expected {'0' * 64}"):
-        hub.list_files(release)
 
 
 def test_the_first_fetch_pins_the_commit(served, tmp_path):
@@ -102,19 +92,6 @@ def test_a_file_that_the_first_fetch_hashed_must_stay_the_same(served, tmp_path)
         fetch(RELEASE, tmp_path / "there")
 
 
-def test_a_missing_file_is_named_with_the_command_that_converts_by_hand(served):
-    release = replace(RELEASE, files={"other.bin": None})
-    with pytest.raises(InputError, match=r"no file other\.bin.*egosim convert weights FOLDER"):
-        hub.list_files(release)
-
-
-def test_a_hub_that_cannot_be_reached_is_one_message(served):
-    release = replace(RELEASE, repository="someone/else")
-    with pytest.raises(InputError, match="someone/else cannot be downloaded") as refused:
-        hub.list_files(release)
-    assert "\n" not in str(refused.value)
-
-
 def test_a_hub_that_fails_after_its_listing_leaves_no_incomplete_download(
     served, tmp_path, monkeypatch
 ):
@@ -129,41 +106,36 @@ def test_a_hub_that_fails_after_its_listing_leaves_no_incomplete_download(
     assert not hub.record_path(RELEASE.name).exists()
 
 
-@pytest.mark.parametrize("name", ["../weights.bin", "/etc/weights.bin", "a/.hidden/weights.bin"])
-def test_unsafe_names_are_refused(name, served, monkeypatch):
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"files": {"weights.bin": "0" * 64}}, f"expected {'0' * 64}"),
+        ({"files": {"other.bin": None}}, r"no file other\.bin.*egosim convert weights FOLDER"),
+        ({"repository": "someone/else"}, "someone/else cannot be downloaded"),
+    ],
+    ids=["hash", "missing", "unreachable"],
+)
+def test_a_hub_without_the_release_is_one_message(served, change, reason):
+    with pytest.raises(InputError, match=reason) as refused:
+        hub.list_files(replace(RELEASE, **change))
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "release", "reason"),
+    [
+        ("../weights.bin", RELEASE, "not a file that can be downloaded safely"),
+        ("/etc/weights.bin", RELEASE, "not a file that can be downloaded safely"),
+        ("a/.hidden/weights.bin", RELEASE, "not a file that can be downloaded safely"),
+        ("a", replace(RELEASE, revision="f" * 40), f"commit {COMMIT} .* expected {'f' * 40}"),
+    ],
+)
+def test_what_a_hub_lists_is_checked(name, release, reason, monkeypatch, served):
     sibling = SimpleNamespace(rfilename=name, size=1, lfs=None)
     info = SimpleNamespace(sha=COMMIT, siblings=[sibling])
     monkeypatch.setattr("huggingface_hub.HfApi.model_info", lambda *args, **options: info)
-    with pytest.raises(InputError, match="not a file that can be downloaded safely"):
-        hub.list_files(replace(RELEASE, files={"*weights.bin": None}))
-
-
-def test_a_damaged_record_is_refused(served):
-    path = hub.record_path(RELEASE.name)
-    path.parent.mkdir(parents=True)
-    path.write_text('{"revision": "main", "files": {}}')
-    with pytest.raises(InputError, match="not a record of a fetched release"):
-        hub.list_files(RELEASE)
-
-
-def test_too_little_disk_space_is_found_before_the_download(tmp_path, monkeypatch):
-    monkeypatch.setattr(hub, "free_space", lambda folder: 10**9)
-    with pytest.raises(InputError, match=r"has 1\.0 GB free, and 2\.5 GB are needed"):
-        hub.check_space(2_500_000_000, tmp_path)
-
-
-def test_a_hub_that_gives_another_commit_is_refused(served, monkeypatch):
-    release = replace(RELEASE, revision="f" * 40)
-    info = SimpleNamespace(sha=COMMIT, siblings=[])
-    monkeypatch.setattr("huggingface_hub.HfApi.model_info", lambda *args, **options: info)
-    with pytest.raises(InputError, match=f"commit {COMMIT} .* expected {'f' * 40}"):
-        hub.list_files(release)
-
-
-def test_a_record_of_another_repository_is_refused(served, tmp_path):
-    fetch(RELEASE, tmp_path / "here")
-    with pytest.raises(InputError, match="records a fetch from 'someone/some-model'"):
-        hub.list_files(replace(RELEASE, repository="someone/else"))
+    with pytest.raises(InputError, match=reason):
+        hub.list_files(replace(release, files={"*weights.bin": None}))
 
 
 def test_text_of_the_hub_is_escaped_and_cut_in_messages(served, monkeypatch):
@@ -175,6 +147,21 @@ def test_text_of_the_hub_is_escaped_and_cut_in_messages(served, monkeypatch):
         hub.list_files(RELEASE)
     assert "\x1b" not in str(refused.value)
     assert len(str(refused.value)) < 400
+
+
+def test_a_record_that_is_damaged_or_of_another_repository_is_refused(served, tmp_path):
+    fetch(RELEASE, tmp_path / "here")
+    with pytest.raises(InputError, match="records a fetch from 'someone/some-model'"):
+        hub.list_files(replace(RELEASE, repository="someone/else"))
+    hub.record_path(RELEASE.name).write_text('{"revision": "main", "files": {}}')
+    with pytest.raises(InputError, match="not a record of a fetched release"):
+        hub.list_files(RELEASE)
+
+
+def test_too_little_disk_space_is_found_before_the_download(tmp_path, monkeypatch):
+    monkeypatch.setattr(hub, "free_space", lambda folder: 10**9)
+    with pytest.raises(InputError, match=r"has 1\.0 GB free, and 2\.5 GB are needed"):
+        hub.check_space(2_500_000_000, tmp_path)
 
 
 def test_an_incomplete_network_counts_as_disk_space_that_is_there(tmp_path):

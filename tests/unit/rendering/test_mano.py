@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from egosim_jax.io.untrusted.pickled_models import read_model
+from egosim_jax.io.untrusted.pickled_arrays import read_model
 from egosim_jax.rendering.mano import ManoPoses, mano_hands, read_mano, read_poses
 from egosim_jax.types import InputError
 from tests.mano import PARENTS, Called, Global, Made, dump, model_pickle, random_model

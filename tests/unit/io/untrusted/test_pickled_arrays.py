@@ -94,13 +94,6 @@ def test_a_forged_pickle_is_refused_with_the_reason_and_not_run(tmp_path, name):
     assert not mark.exists()
 
 
-@pytest.mark.parametrize("kept", [0.0, 0.1, 0.5, 0.99])
-def test_a_truncated_pickle_is_refused(tmp_path, kept):
-    data = pickle.dumps({"a": np.arange(100.0)}, 3)
-    with pytest.raises(InputError):
-        read(tmp_path / "a", data[: int(kept * len(data))])
-
-
 def test_a_file_of_another_hash_is_refused(tmp_path):
     (tmp_path / "a").write_bytes(pickle.dumps({"a": np.arange(3.0)}, 3))
     with pytest.raises(InputError, match="its SHA-256 is"):
