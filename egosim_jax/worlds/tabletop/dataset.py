@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -77,21 +77,14 @@ class DatasetConfig:
         return self.kind
 
     def clips_of(self, seed: int) -> Iterator[TabletopClip]:
-        """Yield the clips of a scene."""
-        kind, cloths = self.kind_of(seed), self.black_cloths
+        """Return the clips of a scene, which are rendered one by one."""
+        settings: dict[str, Any] = {
+            "spec": self.spec, "clips": self.clips, "kind": self.kind_of(seed),
+            "black_cloths": self.black_cloths,
+        }  # fmt: skip
         if self.attempts and np.random.default_rng([seed, 3]).random() < self.attempts:
-            yield from make_attempts(
-                seed, spec=self.spec, clips=self.clips, kind=kind, black_cloths=cloths
-            )
-            return
-        yield from make_sequence(
-            seed,
-            spec=self.spec,
-            clips=self.clips,
-            kind=kind,
-            black_cloths=cloths,
-            fixed_camera=self.fixed_camera,
-        )
+            return make_attempts(seed, **settings)
+        return make_sequence(seed, fixed_camera=self.fixed_camera, **settings)
 
     def __post_init__(self) -> None:
         """Raise `InputError` if the dataset would be empty, or a setting is out of range."""

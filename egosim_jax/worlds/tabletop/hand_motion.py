@@ -237,7 +237,7 @@ def relaxed(point: np.ndarray, side: Side, kind: Kind) -> Grip:
 def grip_on(scene: Scene, intent: Intent, kind: Kind, side: Side) -> Grip:
     """Return the configuration of the hand that grasps the target."""
     body = scene.body(intent.name)
-    inward = 0.5 if side == "right" else -0.5
+    inward, closure = 0.5 if side == "right" else -0.5, closure_for(kind, body.grip_m)
     if body.articulated:
         _, y, z = body.size_m
         handle = (
@@ -245,13 +245,11 @@ def grip_on(scene: Scene, intent: Intent, kind: Kind, side: Side) -> Grip:
         )
         local = moving_part(body, scene.openings[body.name]) @ [*handle, 1.0]
         point = (body.world_from_body @ local)[:3]
-        closure = closure_for(kind, body.grip_m)
         return Grip(point_m=point, yaw=0.0, pitch=np.radians(40), closure=closure)
     height, offset = (0.45 if body.shape == "cone" else 0.62) * body.size_m[2], np.zeros(3)
     if body.shape == "ring":  # the hand grasps its near rim
         offset = np.array([0, -(body.size_m[0] - body.size_m[2]) / 2, 0])
     point = body.world_from_body[:3, 3] + offset + [0, 0, height]
-    closure = closure_for(kind, body.grip_m)
     return Grip(point_m=point, yaw=inward, pitch=np.radians(52), closure=closure)
 
 
