@@ -1,4 +1,4 @@
-"""Samplers of step-distilled LoRAs that people share, recognized by their file's name.
+"""Samplers of step-distilled LoRAs that users share, recognized by their file's name.
 
 Such a LoRA turns a denoiser of 50 guided steps into one of a few steps without guidance, and gives
 noise or blur with any other sampler. Its file says so in its name alone.
@@ -6,7 +6,7 @@ noise or blur with any other sampler. Its file says so in its name alone.
 LightX2V's LoRAs of Wan 2.1 14B (`wan2.1_i2v_lora_rank64_lightx2v_4step`, and others with
 `lightx2v` and `step_distill`): timesteps 1000, 750, 500 and 250, warped by a shift of 5, no
 guidance, and new noise at each step. Source: LightX2V's scheduler of step distillation and its
-configuration of the I2V model, read in November 2026. Those of Wan 2.2 belong to two denoisers.
+configuration of the I2V model, read in November 2026. LoRAs of Wan 2.2 belong to two denoisers.
 """
 
 from __future__ import annotations

@@ -121,7 +121,7 @@ def _connect(address: str, token: str | None, *, wait_s: float) -> Any:
     """Return the connection to a server, which may start meanwhile."""
     import websockets.sync.client
 
-    until, told = time.monotonic() + wait_s, False
+    until, announced = time.monotonic() + wait_s, False
     while True:
         try:
             return websockets.sync.client.connect(
@@ -134,8 +134,8 @@ def _connect(address: str, token: str | None, *, wait_s: float) -> Any:
         except ConnectionRefusedError:  # nothing listens at the address yet
             if time.monotonic() >= until:
                 raise
-        if not told:
-            told = True
+        if not announced:
+            announced = True
             print(f"waits up to {wait_s:g} s for {address} to start", file=sys.stderr, flush=True)
         time.sleep(min(0.5, max(0.0, until - time.monotonic())))
 
