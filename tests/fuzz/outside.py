@@ -62,8 +62,12 @@ def outside(rng: Random) -> Path:
 
 
 def place_special(folder: Path, rng: Random) -> None:
-    """Put a pipe, an empty folder or a link in the place of a file or folder."""
-    place = rng.choice(sorted(folder.rglob("*")))
+    """Put a pipe, an empty folder or a link in the place of something in the only subfolder.
+
+    That folder itself may be a link: a user keeps it where there is space.
+    """
+    (inner,) = [path for path in folder.iterdir() if path.is_dir()]
+    place = rng.choice(sorted(inner.rglob("*")))
     if place.is_dir():
         shutil.rmtree(place)
     else:
