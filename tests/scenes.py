@@ -13,7 +13,7 @@ def pinhole(poses, focal_px, height, width):
 
 
 def state_of(points_m, *, colors=0, ids=0, intrinsics_px=None, **fields):
-    """A state of points; a single color or id is for all of them."""
+    """A state of points; all of them may have one color and one id."""
     count = len(points_m)
     return SceneState(
         points_m=np.asarray(points_m, np.float32),

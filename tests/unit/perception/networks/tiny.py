@@ -14,7 +14,7 @@ def transformers_with_seed():
 
 
 def _normal(parameters, std: float) -> None:
-    """Draw weights again: with an initialization for training, all results are alike."""
+    """Draw weights at random: initialized as for training, a network has one result for all."""
     import torch
 
     with torch.no_grad():
