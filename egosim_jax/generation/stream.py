@@ -27,7 +27,7 @@ from egosim_jax.conditioning.condition import Condition
 from egosim_jax.conditioning.condition import Name as ConditionName
 from egosim_jax.conditioning.pixels import to_model, to_uint8
 from egosim_jax.configs.model import ModelConfig
-from egosim_jax.generation.causal import chunks_of
+from egosim_jax.generation.causal import ChunkDenoiser, chunks_of
 from egosim_jax.generation.compiled import CompiledFn
 from egosim_jax.generation.encoding import last_32_bits, pack_clip, pack_videos, video_shapes
 from egosim_jax.sharding import fetch, parts
@@ -177,7 +177,7 @@ class ClipStream:
         self._check(triplets)
         self._names = [triplet.video_id for triplet in triplets]
         self._begun += 1
-        denoiser = self._generator.denoiser
+        denoiser: ChunkDenoiser | None = self._generator.denoiser
         if denoiser is None:
             return self._generator.latents(triplets, self._seeds, without=self._without)
         self._given.append(triplets)

@@ -105,7 +105,7 @@ def test_fields_of_all_wire_types_are_read():
     [
         (model(kind=2), "of a model of kind 2"),
         (b"\x0b\x01", "is damaged: wire type 3"),
-        *((model()[:cut], "") for cut in (1, 5, 30, 100)),  # it ends early
+        *((model()[:cut], None) for cut in (1, 5, 30, 100)),  # it ends early
     ],
 )
 def test_other_models_and_damaged_files_are_refused(tmp_path, data, message):
