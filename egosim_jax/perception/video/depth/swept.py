@@ -16,7 +16,7 @@ from egosim_jax.perception.video.depth.triangulate import SparseFilter, Triangul
 from egosim_jax.perception.video.estimates import CameraEstimate, DepthEstimate
 from egosim_jax.rendering import POINT_PX
 from egosim_jax.types import Cameras, Counted, InputError
-from egosim_jax.types.arrays import Mask, Masks, Video
+from egosim_jax.types.arrays import DepthMap, Mask, Masks, Video
 
 METRIC_DISTANCE_M = 0.6
 """Distance of the assumed plane from metric cameras, in meters."""
