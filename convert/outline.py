@@ -1,4 +1,4 @@
-"""Outlines of checkpoints on a hub: files of holes that have all that a conversion plans from.
+"""Sparse copies of remote checkpoints: only the bytes that planning a conversion reads.
 
 A safetensors file has its header, a `.pth` its directory and its pickle, and an index its text. So
 the readers and checks of a conversion refuse a checkpoint before it is downloaded. All files have
@@ -33,8 +33,8 @@ def write_outline(
 ) -> None:
     """Write an outline of the files of these sizes in bytes to an empty folder.
 
-    `read` returns the bytes of a file from an offset, of a number above 0. A damaged file is
-    outlined as far as it can be read, so that its reader refuses it.
+    `read(name, offset, count)` returns `count` bytes of a file; `count` is above 0. A damaged file
+    is outlined as far as it can be read, so that its reader refuses it.
     """
     for name, size in sizes.items():
         path = folder / name

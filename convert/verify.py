@@ -133,7 +133,8 @@ def _relative_error(
     """Return the relative L2 error of converted weights' output from a checkpoint's, in float32.
 
     It is absolute if the checkpoint's output is 0, as before the first update of a zero head.
-    Both networks get the same random input. The checkpoint is first cast to the weights' dtype.
+    Both networks get the same random input. If the weights have one dtype, the
+    checkpoint is first cast to it.
     """
     import jax
 
@@ -190,7 +191,7 @@ def _load(
 def _cut(array: np.ndarray, shape: tuple[int, ...], cast: np.dtype | None = None) -> np.ndarray:
     """Return the leading part of an array, of the given shape, in float32."""
     if array.ndim != len(shape) or any(n < m for n, m in zip(array.shape, shape, strict=True)):
-        raise InputError(f"The checkpoint has {array.shape} where PyTorch needs {shape}.")
+        raise InputError(f"The weights have {array.shape} where {shape} is needed.")
     part = array[tuple(map(slice, shape))]
     return np.array(part if cast is None else part.astype(cast), np.float32)
 

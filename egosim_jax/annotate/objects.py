@@ -57,8 +57,10 @@ def find_moved_objects(record: Record, estimators: Estimators, config: AnnotateC
     )  # fmt: skip
 
 
-def measured(standing: Int32[np.ndarray, "h w"], confident: Mask) -> Int32[np.ndarray, "h w"]:
-    """Return the objects whose depth is confident in half of their pixels; the others become 0.
+def drop_unmeasured(
+    standing: Int32[np.ndarray, "h w"], confident: Mask
+) -> Int32[np.ndarray, "h w"]:
+    """Set objects to 0 unless at least half of their pixels have confident depth.
 
     Completed depth has bumps on walls and at the image border that look like objects.
     """
@@ -70,7 +72,7 @@ def measured(standing: Int32[np.ndarray, "h w"], confident: Mask) -> Int32[np.nd
 def join_objects(
     ids: Int32[np.ndarray, "h w"], names: Mapping[int, str], standing: Int32[np.ndarray, "h w"]
 ) -> tuple[Int32[np.ndarray, "h w"], dict[int, str]]:
-    """Return ids and names of the objects that hands move, joined by other objects.
+    """Add standing objects to the ids and names of moved ones; merge those that overlap.
 
     An object whose pixels are mostly on a moved one is part of it.
     """

@@ -12,7 +12,7 @@ from jaxtyping import Float32, UInt8
 from egosim_jax.annotate.captions import RULE, caption_by_rule
 from egosim_jax.annotate.config import AnnotateConfig, Estimators
 from egosim_jax.annotate.hand_tracks import visible
-from egosim_jax.annotate.objects import MOVED, find_moved_objects, join_objects, measured
+from egosim_jax.annotate.objects import MOVED, drop_unmeasured, find_moved_objects, join_objects
 from egosim_jax.annotate.prepare import RefusedError
 from egosim_jax.annotate.record import Record
 from egosim_jax.annotate.stages import (
@@ -163,7 +163,7 @@ def build_state(record: Record, estimators: Estimators, config: AnnotateConfig) 
         standing = find_objects(
             record.require("first_frame"), depth.depth_m[0], cameras.intrinsics_px
         )
-        ids, names = join_objects(ids, names, measured(standing, depth.confident[0]))
+        ids, names = join_objects(ids, names, drop_unmeasured(standing, depth.confident[0]))
     state = state_from_depth(
         record.require("first_frame"),
         depth.depth_m[0],

@@ -157,16 +157,16 @@ def cameras(estimator: CameraEstimator) -> Measure:
             "camera error (ours)",
             "{:.4f}",
             "lower",
-            "ours; RMS distance between positions since the first frame, each path divided by its "
-            "largest distance from there; not measured where the true camera stays "
-            f"within {MIN_EXTENT:g} of it",
+            "ours; RMS distance between positions relative to the first frame, each path divided "
+            f"by its extent; not measured if the ground truth's is at most {MIN_EXTENT:g}",
         ),
         "camera_ate": Column(
             "camera ATE (ours)",
             "{:.4f}",
             "lower",
             "ours; RMS distance between positions since the first frame after the least-squares "
-            "scale, divided by the extent of the ground truth's path",
+            "scale, divided by the extent of the ground truth's path; not measured where the "
+            "camera error is not",
         ),
     }
 

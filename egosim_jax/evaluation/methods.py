@@ -221,7 +221,10 @@ def read_at(
     fit = partial(_fit, shape=shape, border=border, shown=shown)
     frames = read_video(path, start=start, stop=start + shape.frames, each=fit).frames
     if len(frames) < shape.frames:
-        raise InputError(f"{path} ends before frame {start + shape.frames}, which was generated.")
+        raise InputError(
+            f"{path} has {len(frames)} frames from frame {start} on: {shape.frames} are needed. "
+            "Give the complete video."
+        )
     return frames
 
 

@@ -50,7 +50,7 @@ class Maker:
         return {"model": self.model, "weights": hashes(self.weights, student=student)}
 
     def note(self, provenance: Mapping[str, str]) -> str | None:
-        """Return what to know of the clips of a scene, in one line, if there is something."""
+        """Return a one-line warning about the clips of a scene, or None."""
         if self.model is not None:
             return configs.scene_warning(self.trained_on, provenance)
         return preview_note(instead=self.instead)
@@ -103,7 +103,7 @@ def choose(
 
 
 def preview_note(*, instead: bool = False) -> str:
-    """Return what to know of previews; `instead` says why they are shown, and how to get clips."""
+    """Return a warning that clips are previews; `instead` adds why, and how to get others."""
     if not instead:
         return f"These clips are {preview.ABOUT}."
     return (

@@ -1,6 +1,7 @@
 """Rerun recordings of simulations: scene, cameras, hands and videos over time.
 
-Entities, in meters and world coordinates: `world/state`, the points before each clip;
+Entities, in meters and world coordinates: `world/state`, the points before each clip and at the
+end; `action`, the prompts;
 `world/hands/N`, the skeletons; `world/camera`, with the generated frame in its frustum; and the
 videos `view` and `ground_truth`. The timeline `frame` counts through all clips.
 """

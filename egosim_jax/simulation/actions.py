@@ -123,7 +123,7 @@ def _reordering(hand: Float[np.ndarray, "n 21 3"]) -> str:
 
 
 def _bone_problem(hand: Float[np.ndarray, "n 21 3"]) -> str | None:
-    """Return why the bones are not a hand's; None if they are of constant length, none too long."""
+    """Return why the bones cannot be a human hand's, or None."""
     if not len(hand):
         return None
     bones = _bones(hand)
@@ -198,36 +198,36 @@ def load_action(path: Path, *, kind: Kind, size: tuple[int, int], prompt: str) -
 
 @no_type_check
 @dataclass(frozen=True, kw_only=True)
-class PlacedAction(Action):
-    """Action whose hidden hands are missing from `joints_m`, with the joints of all hands.
+class FullAction(Action):
+    """Action that also has the joints of hands out of view, for the ground-truth world.
 
     A model is not given a hand that is out of view; the true world still moves it.
     """
 
-    placed_m: Float[np.ndarray, "f n j 3"]
+    all_joints_m: Float[np.ndarray, "f n j 3"]
     """Joints of all hands in the world, visible or hidden, in meters."""
 
     def __post_init__(self) -> None:
-        """Check as `Action` does; `placed_m` must be finite and agree with `joints_m`."""
+        """Check as `Action` does; `all_joints_m` must be finite and agree with `joints_m`."""
         super().__post_init__()
-        placed, joints = np.asarray(self.placed_m), np.asarray(self.joints_m)
+        placed, joints = np.asarray(self.all_joints_m), np.asarray(self.joints_m)
         agree = placed.shape == joints.shape and np.isfinite(placed).all()
         if not agree or not (np.isnan(joints) | (joints == placed)).all():
             raise InputError(
-                f"placed_m is {placed.dtype} {placed.shape}: it must have the finite joints of all "
-                f"hands {joints.shape}, equal to joints_m where joints_m is finite."
+                f"all_joints_m is {placed.dtype} {placed.shape}: it must have the finite joints of "
+                f"all hands {joints.shape}, equal to joints_m where joints_m is finite."
             )
 
 
-def places_of(action: Action) -> Float[np.ndarray, "f n j 3"]:
+def all_joints_of(action: Action) -> Float[np.ndarray, "f n j 3"]:
     """Return the joints of all hands, including hidden ones if the action has them."""
-    return action.placed_m if isinstance(action, PlacedAction) else action.joints_m
+    return action.all_joints_m if isinstance(action, FullAction) else action.joints_m
 
 
-def with_places(action: Action, placed_m: Float[np.ndarray, "f n j 3"]) -> PlacedAction:
+def with_all_joints(action: Action, all_joints_m: Float[np.ndarray, "f n j 3"]) -> FullAction:
     """Return the action with the joints of all hands."""
     values = {field.name: getattr(action, field.name) for field in fields(Action)}
-    return PlacedAction(**values, placed_m=placed_m)
+    return FullAction(**values, all_joints_m=all_joints_m)
 
 
 def slice_action(action: Action, start: int, end: int | None) -> Action:
@@ -236,8 +236,8 @@ def slice_action(action: Action, start: int, end: int | None) -> Action:
     cameras = replace(action.cameras, world_from_camera=poses)
     joints = seen_hands(cameras, action.joints_m[start:end])
     piece = Action(cameras=cameras, joints_m=joints, kind=action.kind, prompt=action.prompt)
-    if isinstance(action, PlacedAction):
-        return with_places(piece, action.placed_m[start:end])
+    if isinstance(action, FullAction):
+        return with_all_joints(piece, action.all_joints_m[start:end])
     return piece
 
 
@@ -261,10 +261,10 @@ def join_actions(first: Action, then: Action) -> Action:
 
 
 def save_placed(folder: Path, name: str, action: Action) -> None:
-    """Write an action to NAME.npz, and the joints of a `PlacedAction` to NAME_hands.npz."""
-    if isinstance(action, PlacedAction):  # first: NAME.npz alone is an action without hidden hands
+    """Write an action to NAME.npz, and the joints of a `FullAction` to NAME_hands.npz."""
+    if isinstance(action, FullAction):  # first: NAME.npz alone is an action without hidden hands
         with atomic_write(folder / f"{name}{HANDS_SUFFIX}") as temporary:
-            np.savez(temporary, placed_m=np.ascontiguousarray(action.placed_m, float))
+            np.savez(temporary, placed_m=np.ascontiguousarray(action.all_joints_m, float))
     save_action(folder / f"{name}.npz", action)
 
 
@@ -276,7 +276,7 @@ def load_placed(
     path = folder / f"{name}{HANDS_SUFFIX}"
     if not path.exists():
         return action
-    return with_places(action, read_arrays(path, {"placed_m": "float64"})["placed_m"])
+    return with_all_joints(action, read_arrays(path, {"placed_m": "float64"})["placed_m"])
 
 
 def read_action(path: Path, *, height: int, width: int, prompt: str | None) -> Action:

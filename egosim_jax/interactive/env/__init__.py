@@ -101,7 +101,7 @@ def load_backend(
         video=maker.video,
         perception=perception,
         trained_on=maker.trained_on,
-        previews_others=config is None and weights is None,
+        previews_unknown_scenes=config is None and weights is None,
         update_every=update_every,
     )
 

@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float
 from egosim_jax.io.bounded import quote
 from egosim_jax.rendering.mesh import Side
 from egosim_jax.runtime.terminal import counted
-from egosim_jax.simulation.actions import with_places
+from egosim_jax.simulation.actions import with_all_joints
 from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, near_view
 from egosim_jax.worlds.tabletop.hands import joints_of
 
@@ -199,14 +199,14 @@ class ActionSpec:
         """Return the action of one row per frame, and a mask of the hidden hands.
 
         `camera` is the first camera of the episode. A hand that never comes near the view is
-        missing in the action, which is then a `PlacedAction`.
+        missing in the action, which is then a `FullAction`.
         """
         cameras = replace(camera, world_from_camera=self._cameras(rows, camera))
         joints = self.joints(rows)
         lost = np.logical_not(near_view(cameras, joints).any(axis=0, keepdims=True))[0]
         seen = np.where(lost[None, :, None, None], np.nan, joints)
         action = Action(cameras=cameras, joints_m=seen, kind=self.kind, prompt=prompt)
-        return with_places(action, joints) if lost.any() else action, lost
+        return with_all_joints(action, joints) if lost.any() else action, lost
 
     def joints(self, rows: Float[np.ndarray, "k d"]) -> Float[np.ndarray, "k n j 3"]:
         """Return the joints of each row's hands in the world, in meters."""

@@ -44,7 +44,7 @@ class Backend:
         return tabletop_start(seed, spec, self.video)
 
     def note(self, start: Start) -> str | None:
-        """Return what to know of the clips of a start, in one line, if there is something."""
+        """Return a one-line warning about the clips from a start, or None."""
         return None
 
     def simulator(self, start: Start) -> Simulator:
@@ -62,7 +62,7 @@ class GeneratedWorld(Backend):
     """Perception that updates the state: name and options, or None to keep the first state."""
     trained_on: str | None = None
     """Simulated world whose clips trained the generator (`configs.trained_on`); None if unknown."""
-    previews_others: bool = False
+    previews_unknown_scenes: bool = False
     """Previews of scenes that are not of `trained_on`, instead of the generator's clips."""
     update_every: UpdateEvery = "clip"
     """Update of the state after each clip, or after each chunk of a clip."""
@@ -73,13 +73,14 @@ class GeneratedWorld(Backend):
         return chunk_frames(self.generator) or (self.video.frames,)
 
     def identity(self) -> dict[str, str]:
-        """Return the size of the clips, the perception, and the generator's content hash."""
+        """Return the settings that determine the clips; equal ones can resume a session."""
         return {
             "world": preview.NAME if self.makes_previews else "generated",
             "video": str(self.video),
             "perception": str(self.perception),
             "update_every": self.update_every,
             "generator": fingerprint(self.generator),
+            **({"other scenes": preview.NAME} if self.previews_unknown_scenes else {}),
         }
 
     @property
@@ -88,19 +89,19 @@ class GeneratedWorld(Backend):
         return isinstance(self.generator, Preview)
 
     def note(self, start: Start) -> str | None:
-        """Return what to know of the clips of a start: previews, or weights not made for it."""
-        if self.makes_previews or self._instead(start):
+        """Return a warning that clips are previews, or of weights that no such scene trained."""
+        if self.makes_previews or self._gets_preview(start):
             return preview_note(instead=not self.makes_previews)
         return configs.scene_warning(self.trained_on, start.state.provenance)
 
     def simulator(self, start: Start) -> Simulator:
         """Return the simulator of the clip that follows a start."""
-        return self._previews if self._instead(start) else self._simulator
+        return self._previews if self._gets_preview(start) else self._simulator
 
-    def _instead(self, start: Start) -> bool:
+    def _gets_preview(self, start: Start) -> bool:
         """Return True if a start gets previews instead of the generator's clips."""
         foreign = configs.scene_warning(self.trained_on, start.state.provenance) is not None
-        return foreign and self.previews_others
+        return foreign and self.previews_unknown_scenes
 
     @cached_property
     def _previews(self) -> Simulator:

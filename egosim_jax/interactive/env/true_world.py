@@ -17,7 +17,7 @@ from egosim_jax.interactive.env.backends import Backend, is_of_seed
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.perception.oracle import OracleConfig
 from egosim_jax.rendering import jitted
-from egosim_jax.simulation.actions import places_of
+from egosim_jax.simulation.actions import all_joints_of
 from egosim_jax.simulation.simulator import Simulator
 from egosim_jax.simulation.start import Start
 from egosim_jax.types import (
@@ -82,7 +82,7 @@ class TrueWorld(Backend):
             scene = start_of_sequence(start.seed, spec=self.video, kind=kind)[0]
             world = World(scene=scene, seed=start.seed)
         for action in start.past[count:]:
-            world = world.move(action, joints_m=places_of(action))[1]
+            world = world.move(action, joints_m=all_joints_of(action))[1]
         with self._changing:
             self._worlds[keys[-1]] = world
             self._worlds.move_to_end(keys[-1])
@@ -111,7 +111,7 @@ class _Execution:
         """Return the clip of an action."""
         if self._made is None or self._made[0] is not action:
             world = self.world.after(self.start, action.kind)
-            clip, _ = world.execute(action, joints_m=places_of(action))
+            clip, _ = world.execute(action, joints_m=all_joints_of(action))
             self._made = action, clip
         return self._made[1]
 

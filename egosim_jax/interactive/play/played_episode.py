@@ -32,7 +32,7 @@ from egosim_jax.interactive.play.moves import (
 from egosim_jax.interactive.server.parts import Parts
 from egosim_jax.interactive.server.session import Result, Session
 from egosim_jax.rendering.mesh import Side
-from egosim_jax.simulation.actions import places_of
+from egosim_jax.simulation.actions import all_joints_of
 from egosim_jax.simulation.changes import moved_objects
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.simulation.start import Start, check_size
@@ -295,7 +295,7 @@ def _true_scene(start: Start, world: GeneratedWorld) -> Scene | None:
 
 def _film(before: Future[Filmed], action: Action) -> Filmed:
     """Execute an action in the true world, and render it."""
-    joints_m = places_of(action)
+    joints_m = all_joints_of(action)
     scenes, world = before.result()[0].move(action, joints_m=joints_m)
     arms = arms_of(joints_m, action.kind)
     rendered = render_scenes(scenes, action.cameras, arms=arms)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
+from egosim_jax.data.clip_files import prior_column
 from egosim_jax.data.lerobot_writer import ClipRecord, EpisodeRecord, write_lerobot
 from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.interactive.env.backends import GeneratedWorld
-from egosim_jax.interactive.env.chunks import view_of
 from egosim_jax.interactive.server.session import (
     CLOSED,
     DAMAGE,
@@ -23,14 +23,14 @@ from egosim_jax.interactive.server.session import (
 from egosim_jax.io.bounded import only_inside, quote, quote_path
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.journal import Journal
-from egosim_jax.rendering import get
+from egosim_jax.rendering import PriorKind, get
 from egosim_jax.rendering.rerun_log import Recording
 from egosim_jax.simulation import preview
 from egosim_jax.state import snapshot
 from egosim_jax.state.planes import vertical
 from egosim_jax.types import Action, InputError, SceneState, Triplet, VideoGrid, VideoSpec, View
 
-MAX_POINT_PX, MAX_SIZE = 64, 8192
+MAX_POINT_PX, MAX_COUNT = 64, 8192
 """Maximum side of a point in pixels, and number of frames, rows, columns and frames per second."""
 
 
@@ -42,6 +42,8 @@ class _Unavailable:
     """Renderer of the views."""
     point_px: int
     """Side of a point of the views in pixels."""
+    prior: PriorKind
+    """Objects in the views: at rest, or on their predicted paths."""
 
     def __call__(self, view: View, action: Action, first_frame: Any, seed: int) -> Any:
         raise InputError("A recorded session cannot continue here: use egosim serve.")
@@ -88,17 +90,23 @@ def _recorded(path: Path) -> GeneratedWorld:
     settings = settings_of(path)
     fields = settings["video"]
     video = VideoSpec(
-        frames=_size(fields, "frames"),
-        height=_size(fields, "height"),
-        width=_size(fields, "width"),
-        fps=_size(fields, "fps"),
+        frames=_bounded_int(fields, "frames"),
+        height=_bounded_int(fields, "height"),
+        width=_bounded_int(fields, "width"),
+        fps=_bounded_int(fields, "fps"),
     )
-    point_px = _size(settings, "point_px", limit=MAX_POINT_PX)
-    generator = _Unavailable(renderer=get("jax"), point_px=point_px)
+    point_px = _bounded_int(settings, "point_px", limit=MAX_POINT_PX)
+    prior = settings.get("prior", "static")  # sessions without it are older than other priors
+    if prior not in get_args(PriorKind):
+        raise InputError(
+            f"prior in its settings is {quote(prior)}: it must be one of "
+            f"{', '.join(get_args(PriorKind))}. Restore the settings."
+        )
+    generator = _Unavailable(renderer=get("jax"), point_px=point_px, prior=prior)
     return GeneratedWorld(generator=generator, video=video, perception=None)
 
 
-def _size(fields: Mapping[str, Any], name: str, *, limit: int = MAX_SIZE) -> int:
+def _bounded_int(fields: Mapping[str, Any], name: str, *, limit: int = MAX_COUNT) -> int:
     """Return a size of a session's settings. Raises `InputError` if it is out of bounds."""
     value = fields.get(name)
     if type(value) is not int or not 1 <= value <= limit:
@@ -112,7 +120,6 @@ def _size(fields: Mapping[str, Any], name: str, *, limit: int = MAX_SIZE) -> int
 def _check(session: Session) -> None:
     """Read all files that an export needs, and compare them. Raises an error of `DAMAGE`."""
     for start, steps in session.runs():
-        session.backend.simulator(start)
         state, image = start.state, start.first_frame
         for seed, number in enumerate(steps, start.seed + start.steps):
             made_of = {
@@ -124,7 +131,7 @@ def _check(session: Session) -> None:
 
 
 def _check_step(session: Session, number: int, made_of: Mapping[str, str]) -> Result:
-    """Return the result of a step, which must be made of these inputs and of its action."""
+    """Load a step; raise an error of `DAMAGE` if its inputs differ from the journal's."""
     video, made = session.backend.video, session.folder / "steps" / str(number) / "rollout"
     session.actions.check(session.rows(number), max_rows=video.frames)
     journal = Journal(made)
@@ -183,7 +190,8 @@ def _steps(session: Session) -> Iterator[tuple[int, SceneState, View, Any]]:
         state, image = start.state, start.first_frame
         simulator = session.backend.simulator(start)
         for number in steps:
-            view = view_of(simulator, state, session.action(number).cameras)
+            action = session.action(number)
+            view = simulator.render(state, action, simulator.predict(state, action))
             yield number, state, view, view.frames[0] if image is None else image
             state, image = session.load_result(number).state, None
 
@@ -213,7 +221,11 @@ def to_shards(sessions: Sequence[Session], folder: Path, *, grid: VideoGrid) -> 
                     hands=hands,
                     first_frame=image,
                     target=session.load_result(number).frames,
-                    extra={"kind": action.kind, "session": session.id},
+                    extra={
+                        "kind": action.kind,
+                        "session": session.id,
+                        **prior_column(session.backend.simulator(session.now).prior),
+                    },
                 )
                 record = triplet_record(triplet)
                 writer.add(record.arrays, record.metadata)

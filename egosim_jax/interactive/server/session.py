@@ -99,6 +99,7 @@ class Session:
             "actions": actions.to_json(),
             "video": backend.video,
             "point_px": backend.simulator(start).point_px,
+            "prior": backend.simulator(start).prior,
             "seed": start.seed,
             "world": backend.identity(),
         }

@@ -93,7 +93,7 @@ def pinch(joints_m: Float[np.ndarray, "j 3"]) -> tuple[Float[np.ndarray, " 3"], 
 
 
 def opening_of(joints_m: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, " 3"]:
-    """Return the way from one grasping tip to the other in meters; 0 in a fist."""
+    """Return the vector from the thumb or first jaw to the fingers, in meters; 0 in a fist."""
     thumb, fingers = tips_of(joints_m)
     way = fingers - thumb
     if len(joints_m) == JOINTS["human"]:  # the fingertips of a fist are behind the thumb's
@@ -138,8 +138,9 @@ def frame_of(joints_m: Float[np.ndarray, "j 3"], kind: Kind) -> Float[np.ndarray
     # A left hand is a mirror image, with left-handed axes. Its x and z are therefore reversed here.
     if kind == "robot":
         along, across = (joints_m[1] + joints_m[2]) / 2 - joints_m[0], joints_m[2] - joints_m[1]
-        if np.linalg.norm(across) < 1e-6:  # closed: assume horizontal fingers
-            across = np.cross(along, [0.0, 0.0, 1.0])
+        if np.linalg.norm(across) < 1e-6:  # closed: assume that the jaws open horizontally
+            vertical = np.linalg.norm(along[:2]) < 1e-6
+            across = np.cross(along, [0.0, 1.0, 0.0] if vertical else [0.0, 0.0, 1.0])
     else:
         along, across = joints_m[KNUCKLES].mean(axis=0) - joints_m[0], joints_m[17] - joints_m[5]
     along = along / max(float(np.linalg.norm(along)), 1e-9)
@@ -171,7 +172,7 @@ def closure_for(kind: Kind, width_m: float) -> float:
 
 
 def elbow_of(joints_m: Float[np.ndarray, "j 3"], side: Side) -> Float[np.ndarray, " 3"]:
-    """Return the position of the wearer's elbow in meters, for the position of the wrist."""
+    """Return the position of the wearer's elbow in meters, given the position of the wrist."""
     outward = 0.24 if side == "right" else -0.24
     return np.array([0.5 * joints_m[0][0] + outward, -0.20, 0.5 * joints_m[0][2]])
 

@@ -9,7 +9,7 @@ import pytest
 from egosim_jax.annotate.clip import Job, open_record
 from egosim_jax.annotate.frames import Sampling
 from egosim_jax.annotate.hand_tracks import before_entry, drop_flashes, hold_hands, visible, without
-from egosim_jax.annotate.objects import find_moved_objects, join_objects, measured
+from egosim_jax.annotate.objects import drop_unmeasured, find_moved_objects, join_objects
 from egosim_jax.annotate.prepare import Cutting, RefusedError
 from egosim_jax.annotate.scene import (
     STAGES,
@@ -305,6 +305,6 @@ def test_the_background_is_judged_where_the_prior_draws_it(tmp_path):
 def test_an_object_needs_confident_depth_in_half_of_its_pixels():
     standing = np.array([[0, 1, 1], [2, 2, 2]], np.int32)
     confident = np.array([[False, True, False], [True, False, False]])
-    assert measured(standing, confident).tolist() == [[0, 1, 1], [0, 0, 0]]
+    assert drop_unmeasured(standing, confident).tolist() == [[0, 1, 1], [0, 0, 0]]
     ids, names = join_objects(np.zeros((2, 3), np.int32), {}, np.where(standing == 2, standing, 0))
     assert (ids.tolist(), names) == ([[0, 0, 0], [1, 1, 1]], {1: "object 1"})

@@ -134,7 +134,7 @@ def test_a_ground_truth_that_ends_before_the_clip_is_named(clips, run, capsys):
         write_video(run / f"{name}.mp4", np.zeros((13, 32, 48, 3), np.uint8), 16)
     with pytest.raises(InputError, match="could be compared"):
         Evaluate(generated=(str(run),), page_clips=0, metadata=clips).run()
-    assert "ends before frame 13" in capsys.readouterr().err
+    assert "13 are needed" in capsys.readouterr().err
 
 
 def test_a_clip_of_fewer_frames_is_skipped_and_named(clips, run, capsys):

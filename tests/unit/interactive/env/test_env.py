@@ -159,7 +159,7 @@ def test_a_preview_acts_as_a_model_and_says_what_it_is():
 
 
 def test_scenes_that_the_default_weights_do_not_know_get_previews():
-    world = replace(painted(), trained_on="tabletop", previews_others=True)
+    world = replace(painted(), trained_on="tabletop", previews_unknown_scenes=True)
     start = world.start(3, ActionSpec())
     other = replace(start, state=replace(start.state, provenance={"source": "video"}))
     assert world.note(start) is None

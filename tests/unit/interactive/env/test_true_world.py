@@ -11,7 +11,7 @@ from egosim_jax.interactive.env.chunks import make_chunk
 from egosim_jax.interactive.env.rewards import MoveObject
 from egosim_jax.interactive.env.single import WorldEnv
 from egosim_jax.interactive.env.true_world import TrueWorld
-from egosim_jax.simulation.actions import PlacedAction
+from egosim_jax.simulation.actions import FullAction
 from egosim_jax.types import InputError, VideoSpec
 from egosim_jax.worlds.tabletop import make_scripts
 from egosim_jax.worlds.tabletop.policies import POLICIES
@@ -92,7 +92,7 @@ def test_only_hands_out_of_view_have_places_in_a_start(tmp_path):
     past = tmp_path / "start" / "past"
     assert sorted(p.name for p in past.iterdir()) == ["1.npz", "2.npz", "2_hands.npz"]
     found = Start.load(tmp_path / "start").past
-    assert [isinstance(action, PlacedAction) for action in found] == [False, True]
+    assert [isinstance(action, FullAction) for action in found] == [False, True]
     assert np.isnan(found[1].joints_m).all()
 
 

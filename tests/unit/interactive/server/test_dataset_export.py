@@ -15,8 +15,8 @@ from egosim_jax.interactive.server import dataset_export, session
 from egosim_jax.interactive.server.store import Store
 from egosim_jax.io.untrusted.parquet import read_parquet
 from egosim_jax.runtime.command import ExitCode
-from egosim_jax.types import WAN_GRID, InputError
-from tests.painted import VIDEO, painted
+from egosim_jax.types import WAN_GRID, InputError, Motion, ObjectPath
+from tests.painted import VIDEO, PaintedWorld, Painter, painted
 
 
 @pytest.fixture(scope="module")
@@ -73,6 +73,36 @@ def test_shards_have_a_clip_for_each_step(folder, tmp_path):
     records = list(ShardReader(tmp_path / "shards"))
     assert [record.metadata["video_id"] for record in records] == ["one_1", "one_2", "one_3"]
     np.testing.assert_array_equal(records[1].arrays["target"], sessions[0].load_result(2).frames)
+
+
+class Predicting(Painter):
+    prior = "predicted"
+
+
+def test_priors_are_exported_as_the_model_saw_them(tmp_path, monkeypatch):
+    """The motion is made up: a step of a painted world moves nothing."""
+    moved = np.eye(4)[None].repeat(VIDEO.frames, axis=0)
+    moved[1:, 2, 3] = 0.1
+    path = ObjectPath(motion=moved, causes=(), confidence=1.0)
+    monkeypatch.setattr(
+        "egosim_jax.simulation.simulator.predict",
+        lambda state, action, fps: Motion(paths={int(state.object_ids.max()): path}),
+    )
+    world = PaintedWorld(generator=Predicting(), video=VIDEO, perception=None)
+    store = Store(tmp_path / "sessions", world, Limits())
+    made = store.create({"seed": 3, "session": "one"})
+    store.step({"session": "one", "step_id": 1, "actions": made.actions.rest[None]}).result()
+    store.close()
+    sessions, _ = dataset_export.open_sessions(tmp_path / "sessions")
+    dataset_export.to_shards(sessions, tmp_path / "shards", grid=WAN_GRID)
+    (record,) = ShardReader(tmp_path / "shards")
+    assert record.metadata["extra"]["prior_kind"] == "predicted"
+    assert (record.arrays["prior"][1:] != record.arrays["prior"][0]).any()
+    path = tmp_path / "sessions" / "one" / "session.json"
+    settings = json.loads(path.read_text()) | {"prior": "foretold"}
+    session._write_sealed(path, {n: v for n, v in settings.items() if n != session.SEAL})
+    with pytest.raises(InputError, match="prior in its settings is 'foretold'"):
+        dataset_export.open_sessions(tmp_path / "sessions", ["one"])
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from egosim_jax.interactive.options import Limits
 from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.interactive.server.session import Session
 from egosim_jax.interactive.server.store import Store
-from egosim_jax.simulation.actions import places_of
+from egosim_jax.simulation.actions import all_joints_of
 from egosim_jax.types import InputError
 from tests.painted import painted
 from tests.unit.interactive.server.served import rows, step
@@ -111,7 +111,9 @@ def test_a_hand_out_of_view_is_hidden_as_in_an_environment(store, actions, hidde
     joints = made.action(2).joints_m
     assert np.isnan(joints[:, 0]).all()
     np.testing.assert_array_equal(again.action(2).joints_m, joints)
-    np.testing.assert_array_equal(places_of(again.action(2))[-1], made.actions.joints(row[None])[0])
+    np.testing.assert_array_equal(
+        all_joints_of(again.action(2))[-1], made.actions.joints(row[None])[0]
+    )
     nan = np.where(np.arange(len(row)) < 7, np.nan, row)
     with pytest.raises(RequestError, match="Give a hand that is out of view its last place"):
         step(store, made, 3, nan[None])
