@@ -99,9 +99,9 @@ def test_priors_are_exported_as_the_model_saw_them(tmp_path, monkeypatch):
     assert record.metadata["extra"]["prior_kind"] == "predicted"
     assert (record.arrays["prior"][1:] != record.arrays["prior"][0]).any()
     path = tmp_path / "sessions" / "one" / "session.json"
-    settings = json.loads(path.read_text()) | {"prior": "foretold"}
+    settings = json.loads(path.read_text()) | {"prior": "guessed"}
     session._write_sealed(path, {n: v for n, v in settings.items() if n != session.SEAL})
-    with pytest.raises(InputError, match="prior in its settings is 'foretold'"):
+    with pytest.raises(InputError, match="prior in its settings is 'guessed'"):
         dataset_export.open_sessions(tmp_path / "sessions", ["one"])
 
 
