@@ -5,8 +5,6 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING
 
-from egosim_jax.types import InputError
-
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -32,6 +30,8 @@ def check_utf8(name: object) -> None:
 
     Python's text for such a name has surrogates, which no file and few libraries take.
     """
+    from egosim_jax.types import InputError  # imports NumPy: too slow for a command's first line
+
     try:
         str(name).encode()
     except UnicodeEncodeError as error:

@@ -28,6 +28,7 @@ def modules_after(statement: str) -> set[str]:
 
 def test_importing_the_package_imports_nothing_heavy():
     assert not modules_after("import egosim_jax") & {"jax", "flax", "numpy", "av", "grain"}
+    assert "numpy" not in modules_after("import egosim_jax.cli.__main__")  # prints its first line
 
 
 def test_package_citation_and_changelog_have_one_version():
