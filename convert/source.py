@@ -42,11 +42,14 @@ class Source:
 
     @property
     def path(self) -> Path:
-        """Path of this checkpoint alone: its file, its index, or the first of its files."""
+        """Path of this checkpoint alone: its file, index or folder, or the first of its files."""
         if len(self.files) == 1:
             return self.files[0]
         index = self.files[0].with_name(f"{self.name}{INDEX}")
-        return index if index.exists() else self.files[0]
+        if index.exists():
+            return index
+        folder = self.files[0].parent
+        return folder if _checkpoint_files(folder) == set(self.files) else self.files[0]
 
     @property
     def bytes(self) -> int:
@@ -67,8 +70,7 @@ def sources(path: Path) -> Iterator[Source]:
     if not path.is_dir():
         yield _joined(*_numbered(path))
         return
-    left = {f for f in path.iterdir() if f.suffix in (".safetensors", *SUFFIXES) and f.is_file()}
-    left = {file for file in left if not file.name.startswith(".")}  # incomplete files
+    left = _checkpoint_files(path)
     for index in sorted(path.glob(f"*{INDEX}")):
         source = _of_index(index)
         left -= set(source.files)
@@ -84,6 +86,12 @@ def sources(path: Path) -> Iterator[Source]:
                 f"{quote_path(path)} has {len(files)} of the {int(part[2])} files of {name}."
             )
         yield _joined(name, files)
+
+
+def _checkpoint_files(folder: Path) -> set[Path]:
+    """Return the files of a folder that hold tensors, by their suffix; no incomplete ones."""
+    files = (f for f in folder.iterdir() if f.suffix in (".safetensors", *SUFFIXES) and f.is_file())
+    return {file for file in files if not file.name.startswith(".")}
 
 
 def _numbered(file: Path) -> tuple[str, list[Path]]:

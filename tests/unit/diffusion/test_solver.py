@@ -23,7 +23,7 @@ from egosim_jax.types import InputError
 
 PROCESS = RectifiedFlow(shift=2.0)
 DETERMINISTIC = [Euler(), UniPC(order=1), UniPC(order=2), UniPC(order=3), DDIM(), DPMSolver()]
-STOCHASTIC = [DDIM(eta=1.0), Renoise(), DPMSolver(stochastic=True)]
+STOCHASTIC = [DDIM(eta=1.0), DPMSolver(stochastic=True)]
 
 
 def test_solvers_have_the_names_of_other_programs():
