@@ -124,12 +124,14 @@ def test_a_larger_batch_is_taken_as_soon_as_it_is_compiled(generator, make_batch
     batcher = make_batcher(max_batch=8, wait_s=0.0)
 
     def largest():
-        """Return the largest batch of five clips: four of them wait while one is generated."""
+        """Return the largest batch of five clips, most of which wait for the first."""
         generator.held.clear()
         with ThreadPoolExecutor(5) as threads:
             asked = [threads.submit(ask, batcher, seed) for seed in range(5)]
-            wait_until(lambda: len(batcher._waiting) >= 4)
-            generator.held.set()
+            try:
+                wait_until(lambda: len(batcher._waiting) >= 3)  # the first batch has one or two
+            finally:
+                generator.held.set()
         assert [clip.result() for clip in asked] == [0, 1, 2, 3, 4]
         return max(len(batch) for batch in generator.batches)
 
