@@ -124,7 +124,7 @@ def test_a_larger_batch_is_taken_as_soon_as_it_is_compiled(generator, make_batch
     batcher = make_batcher(max_batch=8, wait_s=0.0)
 
     def largest():
-        """Return the largest batch of five clips, most of which wait for the first."""
+        """Return the largest batch of five clips; most of them wait for the first."""
         generator.held.clear()
         with ThreadPoolExecutor(5) as threads:
             asked = [threads.submit(ask, batcher, seed) for seed in range(5)]
