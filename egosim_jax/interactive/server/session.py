@@ -406,7 +406,13 @@ class Session:
 
     def rows(self, number: int) -> Float[np.ndarray, "f d"]:
         """Return the row of each frame of a committed step."""
-        return to_numbers(self._request(number)["rows"])
+        rows = to_numbers(self._request(number)["rows"])
+        if rows.ndim != 2:
+            raise InputError(
+                f"the rows of step {number} are {rows.shape}: each must be a list of numbers. "
+                "Restore the step's request."
+            )
+        return rows
 
 
 def settings_of(folder: Path) -> dict[str, Any]:

@@ -208,6 +208,8 @@ def test_rows_out_of_bounds_are_skipped_even_if_their_hash_is_right(folder, tmp_
         ("closed.json", lambda v: v["video"].update(width=10**9)),
         ("steps/2/request.json", lambda v: v["rows"][2].__setitem__(0, v["rows"][2][0] + 0.01)),
         ("steps/2/request.json", lambda v: v["rows"][2].__setitem__(0, 10**400)),
+        ("steps/2/request.json", lambda v: v.update(rows=3.0)),
+        ("steps/2/request.json", lambda v: v.update(rows=[0.0, 1.0])),
         ("steps/2/request.json", lambda v: v.update(prompt=["x"])),
         ("steps/2/request.json", lambda v: v.update(prompt="Another prompt.")),
     ],
@@ -219,8 +221,9 @@ def test_an_edited_session_is_skipped_even_if_its_hash_is_right(folder, tmp_path
     del fields[session.SEAL]
     change(fields)
     session._write_sealed(path, fields)
-    with pytest.raises(InputError, match="Session one cannot be exported"):
+    with pytest.raises(InputError, match="Session one cannot be exported") as refused:
         dataset_export.open_sessions(tmp_path / "sessions", ["one"])
+    assert "Type-check" not in str(refused.value)
 
 
 @pytest.mark.parametrize("file", ["starts", "starts/0/first_frame.png", "steps/2/info.json"])
