@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from egosim_jax.io.digest import fingerprint
-from egosim_jax.simulation.actions import ORDERS
+from egosim_jax.simulation.actions import ORDERS, check_order
 from egosim_jax.simulation.episode import Episode, _read_ground_truth
 from egosim_jax.state.snapshot import save
 from egosim_jax.types import InputError, VideoSpec
@@ -91,6 +91,19 @@ def test_an_order_that_nobody_listed_is_refused(hands, order, noise_m):
 
     with pytest.raises(InputError, match="wrist, then thumb"):
         with_joints(hands, change)
+
+
+@pytest.mark.parametrize("order", [TIPS_FIRST, LITTLE_FIRST, np.arange(21)[::-1]])
+def test_an_environment_refuses_bones_in_another_order_only(hands, order):
+    """It takes random hands and straight paths between poses, whose bones change, too."""
+    action = hands.actions[1]
+    moving = action.joints_m[:, :1]
+    check_order(replace(action, joints_m=moving), any_hand=True)
+    with pytest.raises(InputError, match="wrist, then thumb"):
+        check_order(replace(action, joints_m=moving[:, :, order]), any_hand=True)
+    share = np.linspace(0, 1, len(moving))[:, None, None, None]
+    for end in (moving[-1][:, order], np.random.default_rng(0).uniform(-0.2, 0.2, (1, 21, 3))):
+        check_order(replace(action, joints_m=moving[:1] * (1 - share) + end * share), any_hand=True)
 
 
 @pytest.mark.parametrize("seed", range(4))
