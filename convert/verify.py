@@ -192,8 +192,8 @@ def _cut(array: np.ndarray, shape: tuple[int, ...], cast: np.dtype | None = None
     """Return the leading part of an array, of the given shape, in float32."""
     if array.ndim != len(shape) or any(n < m for n, m in zip(array.shape, shape, strict=True)):
         raise InputError(f"The weights have {array.shape} where {shape} is needed.")
-    part = array[tuple(map(slice, shape))]
-    return np.array(part if cast is None else part.astype(cast), np.float32)
+    leading = array[tuple(map(slice, shape))]
+    return np.array(leading if cast is None else leading.astype(cast), np.float32)
 
 
 def _readers(

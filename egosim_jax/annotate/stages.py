@@ -67,10 +67,10 @@ class Stage:
 
 def find_hands(record: Record, estimators: Estimators, config: AnnotateConfig) -> Record:
     """Add `hands`. Raises `RefusedError` if too few frames show a hand."""
-    given = record.recording.joints_m
-    if given is not None and record.recording.kind == "human":
-        hands, source = _project_given(record, given), "recording"
-    elif given is not None:
+    recorded_m = record.recording.joints_m
+    if recorded_m is not None and record.recording.kind == "human":
+        hands, source = _project_given(record, recorded_m), "recording"
+    elif recorded_m is not None:
         return record.add("hands", {"source": "recording", "kind": record.recording.kind})
     else:
         tracks = drop_flashes(search_hands(record, estimators), record.fps)
@@ -343,20 +343,20 @@ def _camera_notes(estimate: CameraEstimate, focal_source: str) -> dict[str, Any]
 
 def joints_in_world(record: Record) -> np.ndarray:
     """Return the world joints in meters: recorded, or lifted from pixels."""
-    given = record.recording.joints_m
-    if given is not None:
-        return given[record.source_frames].astype(float)
+    recorded_m = record.recording.joints_m
+    if recorded_m is not None:
+        return recorded_m[record.source_frames].astype(float)
     poses = rearrange(record.cameras.world_from_camera, "f a b -> f 1 a b")
     return transform(poses, _joints_in_cameras(record))
 
 
 def _joints_in_cameras(record: Record) -> np.ndarray:
     """Return the joints in meters in the camera of each frame: recorded, or lifted from pixels."""
-    given = record.recording.joints_m
-    if given is None:
+    recorded_m = record.recording.joints_m
+    if recorded_m is None:
         return lifted_hands(record)
     poses = rearrange(invert(record.cameras.world_from_camera), "f a b -> f 1 a b")
-    return transform(poses, given[record.source_frames].astype(float))
+    return transform(poses, recorded_m[record.source_frames].astype(float))
 
 
 def lifted_hands(record: Record) -> np.ndarray:

@@ -222,13 +222,17 @@ class Generate:
         from egosim_jax import configs
         from egosim_jax.diffusion import SOLVERS, Guidance, RectifiedFlow, StepCache
         from egosim_jax.generation.batch import STRENGTH
-        from egosim_jax.generation.distilled import distilled, is_distilled
+        from egosim_jax.generation.distilled import distilled
 
         config = configs.get(self.config)
         config = config if self.sampling is None else configs.sampled(config, self.sampling)
         config = config if self._weights is None else config.at(self._weights)
-        if self.lora is not None and is_distilled(self.lora) and self.sampling is None:
-            config = distilled(config)
+        if (
+            self.lora is not None
+            and self.sampling is None
+            and (few_steps := distilled(config, self.lora)) is not None
+        ):
+            config = few_steps
             print(
                 f"{printable(self.lora.name)} is distilled: {config.steps} steps without guidance, "
                 "unless --steps, --guidance or --solver say otherwise",

@@ -23,16 +23,11 @@ _NONE_OF = re.compile(r"wan[-_]?2[._]?2", re.I)
 STEPS, SHIFT = 4, 5.0
 
 
-def is_distilled(lora: Path) -> bool:
-    """Return True if a LoRA is one of the step-distilled ones that are known by name."""
-    name = lora.name
-    return all(text.search(name) for text in _ALL_OF) and _NONE_OF.search(name) is None
-
-
-def distilled(config: ModelConfig) -> ModelConfig:
-    """Return a model with the sampler of the step-distilled LoRAs; others than Wan's stay."""
-    if not isinstance(config.process, RectifiedFlow):
-        return config
+def distilled(config: ModelConfig, lora: Path) -> ModelConfig | None:
+    """Return a model with the sampler of a step-distilled LoRA; None if it is not known as one."""
+    by_name = all(text.search(lora.name) for text in _ALL_OF) and not _NONE_OF.search(lora.name)
+    if not by_name or not isinstance(config.process, RectifiedFlow):
+        return None
     return replace(
         config,
         steps=STEPS,

@@ -162,11 +162,11 @@ def describe(differing: Mapping[str, tuple[str, str]]) -> str:
     Options of the command come first, by their names on the command line, and digests last, cut
     to 8 digits. Several fields that follow from one option are one difference.
     """
-    found: dict[str, tuple[tuple[bool, bool, int], str]] = {}
+    shortest: dict[str, tuple[tuple[bool, bool, int], str]] = {}
     for path, (folder, ours) in differing.items():
         option, text = option_of(path), f"the folder has {folder}, this run has {ours}"
         short = _DIGEST.sub(r"\1…", text)
         name, rank = option or path, (option is None, short != text, len(short))
-        found[name] = min(found.get(name, (rank, short)), (rank, short))
-    ordered = sorted(found.items(), key=lambda item: item[1])
+        shortest[name] = min(shortest.get(name, (rank, short)), (rank, short))
+    ordered = sorted(shortest.items(), key=lambda item: item[1])
     return listing([f"{name}: {text}" for name, (_, text) in ordered])

@@ -69,8 +69,8 @@ class Rollout:
             for number, action in enumerate(actions, start=1):
                 check_seed(seed + number, name="seed + number of actions")
                 journal.require(f"{number} action", {"action": fingerprint(action)})
-                given = {"first_frame": first_frame, "frames": frames} if number == 1 else {}
-                step = self._step(journal, number, state, action, seed + number, given)
+                images = {"first_frame": first_frame, "frames": frames} if number == 1 else {}
+                step = self._step(journal, number, state, action, seed + number, images)
                 yield step
                 state = step.state
 
@@ -96,9 +96,9 @@ class Rollout:
         state: SceneState,
         action: Action,
         seed: int,
-        given: Mapping[str, Any],
+        images: Mapping[str, Any],
     ) -> Step:
-        """Run `Simulator.step` with each phase journaled; `given` are its further arguments."""
+        """Run `Simulator.step` with each phase journaled; `images` are its given frames."""
         folder, clip = self.folder / f"clip_{number}", self._name.format(number=number)
 
         def load_made(path: Path) -> Made:
@@ -132,7 +132,7 @@ class Rollout:
             key = f"{number} {name}"
             return journal.phase(key, path, make=made, save=save, load=load, about=about)
 
-        return self.simulator.step(state, action, seed=seed, run=run, **given)
+        return self.simulator.step(state, action, seed=seed, run=run, **images)
 
 
 def _save_frames(path: Path, made: Made) -> None:

@@ -135,9 +135,9 @@ class Simulator:
         clip = OpenClip(self, state, seed=seed, first_frame=first_frame, run=run)
         if frames is not None:
             clip.keep(frames)
-        made = clip.run("generate", lambda: clip.make(action))
+        generated = clip.run("generate", lambda: clip.make(action))
         if not clip.is_made:  # its frames were kept
-            clip.replay(made, action)
+            clip.replay(generated, action)
         return clip.finish(action)
 
     def predict(self, state: SceneState, action: Action) -> Motion | None:

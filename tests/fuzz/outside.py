@@ -28,14 +28,14 @@ NAMES = ("secret.xml", "secret.stl", "secret.png", "secret.json", "secret.npz")
 @functools.cache
 def _folder() -> tempfile.TemporaryDirectory[str]:
     """Make the folder, which is removed at exit."""
-    made = tempfile.TemporaryDirectory(prefix="outside")
-    folder = Path(made.name)
+    temporary = tempfile.TemporaryDirectory(prefix="outside")
+    folder = Path(temporary.name)
     (folder / "secret.xml").write_text('<mujocoinclude><body name="secret"/></mujocoinclude>')
     (folder / "secret.stl").write_bytes(STL)
     (folder / "secret.json").write_text("{}")
     Image.new("RGB", (4, 4), "red").save(folder / "secret.png")
     np.savez(folder / "secret.npz", frames=np.zeros((5, 32, 48, 3), np.uint8))
-    return made
+    return temporary
 
 
 @functools.cache

@@ -55,8 +55,8 @@ def read_pickled_arrays(path: Path, *, sha256: str) -> dict[str, np.ndarray]:
     with refusing_damage(path, fix):
         if digest(data) != sha256:
             raise RefusedError(f"its SHA-256 is {digest(data)}, not {sha256}")
-        found = flatten(_NumPy(data).run(), _Array)
-        return {name: array.values() for name, array in found.items()}
+        arrays = flatten(_NumPy(data).run(), _Array)
+        return {name: array.values() for name, array in arrays.items()}
 
 
 def read_model(path: Path) -> dict[str, np.ndarray]:

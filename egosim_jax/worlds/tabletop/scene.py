@@ -177,11 +177,11 @@ def with_cloths(scene: Scene, rng: np.random.Generator, max_cloths: int) -> Scen
     for number in range(rng.integers(max_cloths + 1)):
         x, y = rng.uniform(*CLOTH_M, 2) / 2
         height = 5e-4 * (number + 1)  # 0.5 mm apart, so overlapping cloths have no equal depth
-        part = Part.plain("cloth", box((-x, -y, 0), (x, y, height)), CLOTH_COLOR)
+        cloth = Part.plain("cloth", box((-x, -y, 0), (x, y, height)), CLOTH_COLOR)
         pose = np.eye(4)
         pose[:3, :3] = rotation_z(rng.uniform(-np.pi, np.pi))
         pose[:2, 3] = rng.uniform(CLOTH_AREA_M[::2], CLOTH_AREA_M[1::2])
-        cloths.append(Placed(part=part, world_from_part=pose, instance_id=TABLE))
+        cloths.append(Placed(part=cloth, world_from_part=pose, instance_id=TABLE))
     return replace(scene, room=(*scene.room, *cloths))
 
 
