@@ -66,8 +66,17 @@ def change(target, sample, folder, case):
 
 def judge(target, folder, want):
     """Read a changed sample; return the failure, or an empty text."""
+    limit_s = time.thread_time() + MAX_SECONDS
+    signal.signal(signal.SIGPROF, stop_after(limit_s))
+    signal.setitimer(signal.ITIMER_PROF, MAX_SECONDS)
     try:
-        got = fingerprint(target.read(folder))
+        try:
+            value = target.read(folder)
+        finally:
+            signal.setitimer(signal.ITIMER_PROF, 0)
+        if time.thread_time() > limit_s:
+            return "slow"
+        got = fingerprint(value)
     except InputError as error:
         message = str(error)
         clear = len(message) <= MAX_MESSAGE and message.isprintable()
@@ -107,13 +116,8 @@ def test_a_damaged_file_is_refused_or_read_as_it_was(target, tmp_path):
             kind = change(target, sample, folder, case)
             Path("/proc/self/clear_refs").write_text("5", "ascii")
             was_opened()
-            started, had = time.thread_time(), peak_bytes()
-            signal.signal(signal.SIGPROF, stop_after(started + MAX_SECONDS))
-            signal.setitimer(signal.ITIMER_PROF, MAX_SECONDS)
+            had = peak_bytes()
             problem = judge(target, folder, want)
-            signal.setitimer(signal.ITIMER_PROF, 0)
-            if time.thread_time() - started > MAX_SECONDS:
-                problem = "slow"
             if peak_bytes() - had > MAX_BYTES:
                 problem = f"{peak_bytes() - had:,} bytes of memory"
             if was_opened():

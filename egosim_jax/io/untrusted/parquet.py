@@ -23,8 +23,8 @@ def read_parquet(
 ) -> dict[str, list[Any]]:
     """Return the values of columns, as Python values, by name; only these columns are read.
 
-    Raises `InputError` if a column that is not optional is missing, or if the file is damaged or
-    declares more than is read.
+    Raises `InputError` if a column that is not optional is missing or holds something other than
+    numbers, texts and lists of them, or if the file is damaged or declares more than is read.
     """
     found = read_file(_read, path, columns, optional)
     return {
@@ -51,6 +51,14 @@ def _read(
                     f"{quote_text(', '.join(found))}."
                 )
             wanted = [*columns, *(column for column in optional if column in found)]
+            for column in wanted:
+                kind = opened.schema_arrow.field(column).type
+                if not _is_plain(kind):
+                    raise InputError(
+                        f"Column {quote_text(column)} of {name} has values of type "
+                        f"{quote_text(str(kind))}: numbers, texts and lists of them are read. "
+                        "Write the column as one of these."
+                    )
             _check_sizes(opened.metadata, wanted, name)
             # Column by column: Arrow's copy of one is freed before the next one is read.
             return {
@@ -63,6 +71,17 @@ def _read(
             raise InputError(
                 f"{name} is not a readable Parquet file: {quote_text(str(error))}."
             ) from error
+
+
+def _is_plain(kind: Any) -> bool:
+    """Whether values are numbers, texts or lists of them; a million dates take 20 s in Python."""
+    import pyarrow.types as of
+
+    outer = of.is_dictionary, of.is_list, of.is_large_list, of.is_fixed_size_list
+    if any(is_outer(kind) for is_outer in outer):
+        return _is_plain(kind.value_type)
+    plain = of.is_integer, of.is_floating, of.is_boolean, of.is_string, of.is_large_string
+    return of.is_null(kind) or any(is_plain(kind) for is_plain in plain)
 
 
 def _values(column: Any) -> np.ndarray | list[Any]:

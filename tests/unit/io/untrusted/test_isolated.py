@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 import zlib
+from decimal import Decimal
 from pathlib import Path
 
 import h5py
@@ -45,6 +46,35 @@ def test_columns_come_back_as_they_are(tmp_path):
     table = {"a": [1, 2], "b": [["x"], []], "c": [0.5, None]}
     pq.write_table(pa.table(table), tmp_path / "a.parquet")
     assert read_parquet(tmp_path / "a.parquet", ["a", "b"], optional=["c", "d"]) == table
+
+
+KINDS = {
+    "timestamp[ns]": np.zeros(1 << 20, "M8[ns]"),
+    "list<element: date32[day]>": pa.array([[0]], pa.list_(pa.date32())),
+    "decimal128(3, 1)": pa.DictionaryArray.from_arrays(
+        pa.array([0], pa.int32()), pa.array([Decimal("10.5")])
+    ),
+    "struct<b: int64>": pa.array([{"b": 1}]),
+    "binary": pa.array([b"x"]),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_values_that_are_slow_in_python_are_refused(tmp_path, kind):
+    pq.write_table(pa.table({"a": KINDS[kind], "b": KINDS[kind]}), tmp_path / "a.parquet")
+    with pytest.raises(InputError) as caught:
+        read_parquet(tmp_path / "a.parquet", [], optional=["b"])
+    assert str(caught.value).startswith(
+        f"Column b of {tmp_path}/a.parquet has values of type {kind}: numbers, texts and lists "
+    )
+
+
+def test_nested_and_packed_numbers_are_read(tmp_path):
+    grid = pa.array([[[1.5, 2], [3, 4]]], pa.list_(pa.list_(pa.float32(), 2)))
+    name = pa.array(["left"]).dictionary_encode()
+    pq.write_table(pa.table({"a": grid, "b": name, "c": pa.nulls(1)}), tmp_path / "a.parquet")
+    found = read_parquet(tmp_path / "a.parquet", ["a", "b", "c"])
+    assert found == {"a": [[[1.5, 2], [3, 4]]], "b": ["left"], "c": [None]}
 
 
 def _pid(path):
@@ -126,8 +156,8 @@ def dictionary(path):
 
 
 def runs(path):
-    """Lists of structs, all equal."""
-    rows = pa.array([{"b": [{"c": 1}] * 4}] * 500_000)
+    """Lists of texts, all equal."""
+    rows = pa.array([["x" * 99] * 8] * 1_000_000)
     pq.write_table(pa.table({"x": rows}), path)
 
 
