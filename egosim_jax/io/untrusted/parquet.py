@@ -74,7 +74,7 @@ def _read(
 
 
 def _is_plain(kind: Any) -> bool:
-    """Whether values are numbers, texts or lists of them; a million dates take 20 s in Python."""
+    """Return whether values are numbers, texts or lists; a million dates take 20 s in Python."""
     import pyarrow.types as of
 
     outer = of.is_dictionary, of.is_list, of.is_large_list, of.is_fixed_size_list
