@@ -240,7 +240,7 @@ class Lora:
     """File to write; with --merge, a weights folder with the other networks of that one."""
     merge: Path | None = None
     """Weights folder to merge the LoRA into."""
-    scale: float = 1.0
+    scale: Annotated[float, tyro.conf.arg(aliases=["--lora-scale"])] = 1.0
     """Strength of the LoRA in a merge."""
     base: Path | None = None
     """Weights folder that the LoRA was trained on; the file's header gets its hash."""

@@ -48,7 +48,7 @@ def test_all_changes_are_merged_applied_and_written_alike(tmp_path, full):
     file, tensors = full
     folder, base = ours(tmp_path / "base", "dit"), "diffusion_model.blocks.1"
     args = ["lora", str(file), "--config", "debug"]
-    merge = ["--merge", str(folder), "--scale", "0.5", "--out", str(tmp_path / "out")]
+    merge = ["--merge", str(folder), "--lora-scale", "0.5", "--out", str(tmp_path / "out")]
     assert main([*args, *merge]) == 0
     have, before = load_file(tmp_path / "out" / "dit.safetensors"), arrays("dit")
     added = {path: have[path] - before[path] for path in have}
