@@ -49,6 +49,14 @@ SAME_WAY = 0.7
 """Minimum cosine between two steps of a hand that belong to one motion."""
 MAX_ENDS = 9
 """Maximum number of frames at which a hold may begin or end if the fingers do not say when."""
+MAX_TWIST_DEG, MAX_TILT_DEG = 60.0, 30.0
+"""Largest turns about the vertical and away from it, in degrees, that noise may explain."""
+PALM_WIDTH_M, PALM_LENGTH_M = 0.045, 0.08
+"""Size of a palm, over which noise turns it, in meters."""
+FIRST_FRAMES = 5
+"""Frames of a noisy hold of which the most typical one gives the palm's first direction."""
+TURNED_SHARE = 0.8
+"""Share of a hold's frames that are below its typical largest turn; the rest may be outliers."""
 WIDE_M = 0.01
 """Minimum closing of a hand that holds what it closes on in the next clip, in meters."""
 MIN_FRAMES = 2
@@ -57,6 +65,8 @@ MAX_ARC_DEG, MIN_ARC_DEG = 120.0, 25.0
 """Range of the angle of a hinge, in degrees; a shorter arc does not show its axis."""
 MAX_ARC_ERROR = 0.05
 """Maximum distance of the pinch point from an arc, as a fraction of its radius."""
+MIN_ARC_FRAMES = 8
+"""Minimum number of frames of a noisy hand's arc."""
 EDGE_M = 0.03
 """Maximum distance of a lid's or door's points from its hinge, in meters."""
 
@@ -67,8 +77,10 @@ class Hold:
 
     begin: int
     """First frame."""
+    steady: int
+    """Last frame in which the opening is as at the beginning."""
     end: int
-    """Last frame."""
+    """Last frame. A noisy hand holds on until it opens, although its opening may seem to close."""
     closes: bool
     """True if the hand closes just before."""
     opens: bool
@@ -95,17 +107,19 @@ def find_holds(track: HandTrack) -> list[Hold]:
     holds: list[Hold] = []
     begin = 0
     while begin < len(track.present) - MIN_FRAMES:
-        end = _last_steady(track, begin)
-        if not track.present[begin] or end - begin < MIN_FRAMES:
+        steady = _last_steady(track, begin)
+        if not track.present[begin] or steady - begin < MIN_FRAMES:
             begin += 1
             continue
         opening = track.opening_m
         before = opening[max(0, begin - CLOSING_FRAMES) : begin]
-        steady = float(np.median(opening[begin : end + 1]))
-        closing = before.max() - steady if len(before) else 0.0
+        width = float(np.median(opening[begin : steady + 1]))
+        closing = before.max() - width if len(before) else 0.0
+        end = _last_closed(track, steady, width) if track.sigma_m else steady
         holds.append(
             Hold(
                 begin=begin,
+                steady=steady,
                 end=end,
                 closes=bool(closing > CLOSING_M + SIGMAS * track.sigma_m),
                 opens=end + 1 < len(opening),
@@ -113,6 +127,13 @@ def find_holds(track: HandTrack) -> list[Hold]:
         )
         begin = begin + 1 if track.sigma_m else end + 1
     return holds
+
+
+def first_hold(track: HandTrack) -> Hold:
+    """Return the hold of a noisy hand that holds something in the first frame."""
+    width = float(np.median(track.opening_m[:CLOSING_FRAMES]))
+    end = _last_closed(track, 0, width)
+    return Hold(begin=0, steady=0, end=end, closes=True, opens=end + 1 < len(track.present))
 
 
 def possible_holds(track: HandTrack) -> list[Hold]:
@@ -127,7 +148,7 @@ def possible_holds(track: HandTrack) -> list[Hold]:
     frames = np.flatnonzero(track.present)
     ends = frames[np.linspace(0, len(frames) - 1, min(len(frames), MAX_ENDS)).astype(int)]
     return [
-        Hold(begin=begin, end=end, closes=False, opens=end + 1 < len(track.present))
+        Hold(begin=begin, steady=end, end=end, closes=False, opens=end + 1 < len(track.present))
         for begin, end in combinations(ends.tolist(), 2)
         if end - begin >= MIN_FRAMES
     ]
@@ -167,13 +188,21 @@ def _last_steady(track: HandTrack, begin: int) -> int:
     return frames - 1
 
 
+def _last_closed(track: HandTrack, steady: int, width_m: float) -> int:
+    """Return the frame from `steady` on before the one in which a noisy hand opens or is lost."""
+    wide = track.opening_m > width_m + CLOSING_M + SIGMAS * track.sigma_m
+    wide &= np.append(wide[1:], wide[-2])  # one wide frame is noise
+    ended = np.flatnonzero((wide | ~track.present)[steady + 1 :])
+    return steady + int(ended[0]) if len(ended) else len(wide) - 1
+
+
 def contact_of(solid: Solid, pose: Pose, track: HandTrack, hold: Hold) -> Contact | None:
     """Return the contact of the fingers around a solid in a hold; None if they do not grip it.
 
     A hand may close and begin to carry between two frames. So the pinch point of the frame before
     the hold counts too, first if the hand's motions before and after have one direction.
     """
-    tips = track.grasping_m(hold.begin, hold.end)
+    tips = track.grasping_m(hold.begin, hold.steady)
     pinch, slack = tips.mean(axis=0), SIGMAS * track.sigma_m
     for point in _pinch_points(track, hold, pinch):
         around = tips - pinch + point
@@ -216,13 +245,15 @@ def is_grip(contact: Contact, track: HandTrack, hold: Hold) -> bool:
 def hand_motion(track: HandTrack, hold: Hold, first_m: Vector, up: Vector) -> Poses:
     """Return the rigid motion of a hand since the beginning of a hold, constant after its end.
 
-    `first_m` is the pinch point at the beginning (`Contact`). A noisy hand only turns about the
-    vertical, unless it clearly tilts.
+    `first_m` is the pinch point at the beginning (`Contact`). A noisy hand only moves, unless it
+    clearly turns.
     """
     when = np.clip(np.arange(len(track.present)), hold.begin, hold.end)
-    turn = track.rotation[when] @ track.rotation[hold.begin].T
     if track.sigma_m > 0:
-        turn = _without_small_tilt(turn, track.sigma_m, up)
+        turn = _clear_turn(track.rotation[hold.begin : hold.end + 1], track.sigma_m, up)
+        turn = turn[when - hold.begin]
+    else:
+        turn = track.rotation[when] @ track.rotation[hold.begin].T
     motion = np.repeat(np.eye(4)[None], len(when), axis=0)
     motion[:, :3, :3] = turn
     middle = track.center_m if track.sigma_m else track.pinch_m
@@ -232,15 +263,32 @@ def hand_motion(track: HandTrack, hold: Hold, first_m: Vector, up: Vector) -> Po
     return motion
 
 
-def _without_small_tilt(
-    turn: Float[np.ndarray, "f 3 3"], sigma_m: float, up: Vector
+def _clear_turn(
+    rotation: Float[np.ndarray, "f 3 3"], sigma_m: float, up: Vector
 ) -> Float[np.ndarray, "f 3 3"]:
-    """Return rotations without a tilt that the noise of a hand explains."""
+    """Return rotations of a noisy palm since its first frame, without what noise explains.
+
+    Hands that a network lifts from a video turn back and forth by tens of degrees. The first
+    direction is the most typical one of some frames, and single frames show no turn.
+    """
+    first = rotation[:FIRST_FRAMES]
+    apart = np.linalg.norm(first[:, None] - first[None], axis=(2, 3)).sum(axis=1)
+    turn = rotation @ first[apart.argmin()].T
     tilt = np.degrees(np.arccos(np.clip(np.einsum("i,fij,j->f", up, turn, up), -1, 1)))
-    limit = min(30.0, np.degrees(6 * sigma_m / 0.08))  # over the length of a palm
-    if tilt.max() > limit:
-        return turn
-    return np.stack([twist(matrix, up) for matrix in turn])
+    if _is_clear(tilt, sigma_m / PALM_LENGTH_M, MAX_TILT_DEG):
+        return turn @ turn[0].T
+    twists = np.stack([twist(matrix, up) for matrix in turn])
+    cosines = (np.trace(twists, axis1=1, axis2=2) - 1) / 2
+    if _is_clear(
+        np.degrees(np.arccos(np.clip(cosines, -1, 1))), sigma_m / PALM_WIDTH_M, MAX_TWIST_DEG
+    ):
+        return twists @ twists[0].T
+    return np.repeat(np.eye(3)[None], len(turn), axis=0)
+
+
+def _is_clear(angles_deg: Float[np.ndarray, " f"], noise: float, largest_deg: float) -> bool:
+    limit = min(largest_deg, np.degrees(6 * noise))
+    return bool(np.quantile(angles_deg, TURNED_SHARE) > limit)
 
 
 def twist(rotation: Matrix, axis: Vector) -> Matrix:
@@ -256,8 +304,10 @@ def twist(rotation: Matrix, axis: Vector) -> Matrix:
 def hinge_motion(track: HandTrack, hold: Hold) -> Poses | None:
     """Return the motion of an object on a hinge; None unless the pinch point describes an arc.
 
-    The motion is constant before and after the hold.
+    The motion is constant before and after the hold. A few noisy points always look like an arc.
     """
+    if track.sigma_m and hold.end - hold.begin < MIN_ARC_FRAMES:
+        return None
     path_m = track.pinch_m[hold.begin : hold.end + 1]
     middle = path_m.mean(axis=0)
     across, along, normal = np.linalg.svd(path_m - middle, full_matrices=False)[2]

@@ -14,11 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from egosim_jax.dynamics.grips import (
+    SIGMAS,
     Contact,
     Hold,
     closes_on,
     contact_of,
     find_holds,
+    first_hold,
     hand_motion,
     hinge_motion,
     is_along_edge,
@@ -101,7 +103,7 @@ class Prediction:
             solids=solids,
             tracks=self.tracks,
             holds={
-                hand: [given[hand][1]] if hand in given else find_holds(track)
+                hand: [given[hand][1]] if hand in given else self._holds(hand, track)
                 for hand, track in self.tracks.items()
             },
             given={hand: number for hand, (number, _) in given.items()},
@@ -118,6 +120,11 @@ class Prediction:
             _grasp(walk)
             walk.next_frame()
         return _motion(walk, self.scene)
+
+    def _holds(self, hand: int, track: HandTrack) -> list[Hold]:
+        """Return the possible holds of a hand, first that of what it held before."""
+        held_on = self.held_before.get(hand) in self.scene.solids and track.present[0]
+        return [*([first_hold(track)] if held_on and track.sigma_m else []), *find_holds(track)]
 
     def possible_grips(self, hand: int, number: int) -> Iterator[tuple[Hold, ObjectPath]]:
         """Yield the holds in which a hand near an object may carry it, each with the path so far.
@@ -186,10 +193,15 @@ def _motion(walk: Walk, scene: LevelScene) -> Motion:
 
 def _carry(walk: Walk) -> None:
     """Move held objects, and the objects on them, with their hands."""
-    for grip in walk.grips.values():
+    for hand, grip in walk.grips.items():
         pose = grip.motion[walk.frame] @ grip.start
         if grip.how == "held":
-            pose = raised(walk, grip.number, pose)
+            above = raised(walk, grip.number, pose)
+            sigma_m = walk.tracks[hand].sigma_m
+            if sigma_m and above[2, 3] - pose[2, 3] > SIGMAS * sigma_m:  # the hand left it there
+                walk.grips[hand] = grip.ending(walk.frame)
+                continue
+            pose = above
         carry_riders(walk, grip.number, pose, grip.hand)
         walk.move(grip.number, pose, grip.how, grip.hand)
 
@@ -255,9 +267,12 @@ def _gripped(walk: Walk, hand: int, hold: Hold) -> tuple[int, Contact] | None:
     held before, or what it is around in the first frame. A noisy hand waits for its best frame.
     """
     track, contacts = walk.tracks[hand], {}
-    if hand in walk.given:
+    certain = walk.given.get(hand)
+    if hold.begin == 0 and track.sigma_m:
+        certain = walk.held_before.get(hand, certain)
+    if certain is not None and certain in walk.solids:
         pinch = track.pinch_m[hold.begin]
-        return walk.given[hand], Contact(pinch_m=pinch, depth_m=float("inf"), gap_m=0.0)
+        return certain, Contact(pinch_m=pinch, depth_m=float("inf"), gap_m=0.0)
     for number, solid in walk.solids.items():
         if number in walk.in_hands or (hand, number) in walk.left:
             continue

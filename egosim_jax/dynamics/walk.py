@@ -35,6 +35,10 @@ class Grip:
     start: Float[np.ndarray, "4 4"]
     """Pose of the object at the beginning of the hold."""
 
+    def ending(self, frame: int) -> Grip:
+        """Return the grip with a hold that ends in a frame."""
+        return replace(self, hold=replace(self.hold, end=frame, opens=True))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Fall:

@@ -32,6 +32,9 @@ WALL_AREA_M2, WALL_TILT_DEG = 0.25, 50.0
 """Minimum area of a wall, and minimum angle between its normal and the upward direction."""
 MAX_WALLS = 4
 """Maximum number of walls."""
+MAX_APART = 0.02
+"""Maximum difference in depth of a pixel and the subsampled one that it has its object of, as a
+share."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -258,17 +261,30 @@ def _grow_down(
 def _refine(
     labels: Int32[np.ndarray, "h w"], depth_m: Float[np.ndarray, "r c"], every: int
 ) -> Int32[np.ndarray, "r c"]:
-    """Return labels at the size of the image: each pixel has its subsampled pixel's, if as deep."""
+    """Return labels at the size of the image.
+
+    Each pixel has the label of its subsampled pixel if that is as deep, or else that of the
+    neighbor of the nearest depth. The edge of an object would stay behind where it stood.
+    """
     if every == 1:
         return labels
     height, width = depth_m.shape
-    fine, coarse = (
-        np.repeat(np.repeat(x, every, axis=0), every, axis=1)[:height, :width]
-        for x in (labels, depth_m[::every, ::every])
-    )
-    with np.errstate(invalid="ignore"):
-        same = np.abs(depth_m - coarse) <= 0.02 * coarse
-    return np.where(same, fine, 0).astype(np.int32)
+    padded = np.pad(depth_m[::every, ::every], 1, constant_values=np.nan)
+    shifts = [(0, 0), (0, 1), (0, -1), (1, 0), (-1, 0)]
+    refined, nearest = np.zeros(depth_m.shape, np.int32), np.full(depth_m.shape, np.inf)
+    for down, right in shifts:
+        rows, columns = slice(1 + down, -1 + down or None), slice(1 + right, -1 + right or None)
+        fine, coarse = (
+            np.repeat(np.repeat(x, every, axis=0), every, axis=1)[:height, :width]
+            for x in (np.pad(labels, 1)[rows, columns], padded[rows, columns])
+        )
+        with np.errstate(invalid="ignore", divide="ignore"):
+            apart = np.abs(depth_m - coarse) / coarse
+            closer = (apart <= MAX_APART) & (apart < nearest)
+        refined[closer], nearest[closer] = fine[closer], apart[closer]
+        if (down, right) == (0, 0):
+            nearest[closer] = 0.0
+    return refined
 
 
 def object_sizes(state: SceneState) -> dict[int, Vector]:
