@@ -11,6 +11,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import product
 from typing import no_type_check
 
 import numpy as np
@@ -270,7 +271,7 @@ def _refine(
         return labels
     height, width = depth_m.shape
     padded = np.pad(depth_m[::every, ::every], 1, constant_values=np.nan)
-    shifts = [(0, 0), (0, 1), (0, -1), (1, 0), (-1, 0)]
+    shifts = sorted(product((0, 1, -1), repeat=2), key=lambda shift: shift != (0, 0))
     refined, nearest = np.zeros(depth_m.shape, np.int32), np.full(depth_m.shape, np.inf)
     for down, right in shifts:
         rows, columns = slice(1 + down, -1 + down or None), slice(1 + right, -1 + right or None)

@@ -71,13 +71,32 @@ def test_points_without_an_id_are_predicted_like_an_object():
     np.testing.assert_allclose(path.motion, expected.motion, atol=1e-9)
 
 
-def test_an_object_in_a_hand_has_the_support_that_it_was_taken_from():
+def lifted_state():
+    """Return the state with the cube in the first hand, 15 cm above the table."""
     pose = np.eye(4)
     pose[:3, 3] = [0.1, 0, 0.15]
     state = make_state(world_from_object={1: pose}, held={0: 1})
     points = state.points_m.copy()
     points[state.object_ids == 1] += pose[:3, 3].astype(np.float32)
-    state = replace(state, points_m=points)
+    return replace(state, points_m=points)
+
+
+@pytest.mark.parametrize("down_m", [0.1, 0.3])
+def test_a_noisy_hand_keeps_what_it_held_until_it_would_press_it_into_the_table(down_m):
+    path = [0.1, 0, 0.17] - np.linspace(0, down_m, FRAMES)[:, None] * [0, 0, 1]
+    jaws = [path + [x, 0, 0] for x in (-0.035, 0.035)]  # too wide for the cube
+    joints = np.stack([path + [0, 0, 0.12], *jaws], axis=1)[:, None]
+    joints = joints + np.random.default_rng(0).normal(0, 0.002, joints.shape)
+    action = Action(cameras=CAMERAS, joints_m=joints, kind="robot", prompt="")
+    motion = Prediction.of(lifted_state(), action).motion()
+    assert motion.held == ({0: 1} if down_m < 0.15 else {})
+    lowered = [0, 0, -min(down_m, 0.15)]
+    np.testing.assert_allclose(motion.paths[1].motion[-1, :3, 3], lowered, atol=0.006)
+    np.testing.assert_allclose(motion.paths[1].motion[:, :3, :3], [np.eye(3)] * FRAMES)
+
+
+def test_an_object_in_a_hand_has_the_support_that_it_was_taken_from():
+    state = lifted_state()
     eye = CAMERAS.world_from_camera[0]
     scene = level_scene(state, eye, eye[None, :3, 3], reach_m=np.inf)
     assert scene.solids[1].lifted_m == pytest.approx(0.15)

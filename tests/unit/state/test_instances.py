@@ -99,6 +99,18 @@ def test_a_subsampled_image_has_the_same_objects():
     assert min(unions.values()) > 0.8, unions
 
 
+@pytest.mark.parametrize("max_width", [160, 107])
+def test_the_edge_of_an_object_belongs_to_it_in_a_subsampled_image(max_width):
+    view = cameras(1, height=192, width=320)
+    box = replace(GREEN, size_m=(0.06, 0.06, 0.15))  # far before what is behind its edge
+    _, depth, ids = cast([box], view)
+    labels, _ = search([box], view=view, max_width=max_width)
+    jumps = np.diff(depth, axis=0) < -0.05 * depth[1:]
+    top = np.argwhere(jumps & (np.diff((ids > 0).astype(int), axis=0) == 1)) + [1, 0]
+    assert len(top) > 20
+    assert (labels[tuple(top.T)] > 0).mean() > 0.9
+
+
 def test_sizes_are_of_the_visible_points():
     image, depth, ids = cast([GREEN], VIEW)
     state = state_from_depth(image, depth, VIEW.intrinsics_px, np.eye(4), object_ids=ids)
