@@ -30,10 +30,10 @@ from egosim_jax.dynamics.grips import (
 from egosim_jax.dynamics.hands import HandTrack, track_hand
 from egosim_jax.dynamics.level import LevelScene, level_scene, to_world
 from egosim_jax.dynamics.pushes import push
-from egosim_jax.dynamics.solids import Solid
+from egosim_jax.dynamics.solids import Solid, make_solid
 from egosim_jax.dynamics.support import UP, carry_riders, fall, furniture, next_to, raised, release
 from egosim_jax.dynamics.walk import Grip, Walk
-from egosim_jax.geometry import rotation_angles_deg, transform
+from egosim_jax.geometry import invert, rotation_angles_deg, transform
 from egosim_jax.types import Action, SceneState
 from egosim_jax.types.arrays import Points, Pose, Poses, Vector
 from egosim_jax.types.motion import Cause, How, Motion, ObjectPath
@@ -62,6 +62,8 @@ class Prediction:
     """Track of each hand that is in view."""
     held_before: Mapping[int, int]
     """Object that each hand held before the first frame."""
+    first: Mapping[int, Solid]
+    """Objects that have moved since the first state, where they were there."""
     fps: int
     """Frames per second."""
 
@@ -84,6 +86,7 @@ class Prediction:
             scene=scene,
             tracks={hand: _in_level(track, scene) for hand, track in tracks.items()},
             held_before=state.held,
+            first=_first_solids(scene, state.world_from_object),
             fps=fps,
         )
 
@@ -109,7 +112,7 @@ class Prediction:
             given={hand: number for hand, (number, _) in given.items()},
             held_before=self.held_before,
             ground_m=self.scene.ground_m,
-            furniture=furniture(solids),
+            furniture=furniture(solids) | furniture({**solids, **self.first}),
         )
         for frame in range(len(next(iter(self.tracks.values())).present)):
             if frame:
@@ -162,6 +165,17 @@ def _in_level(track: HandTrack, scene: LevelScene) -> HandTrack:
         center_m=transform(level, track.center_m),
         rotation=level[:3, :3] @ track.rotation,
     )
+
+
+def _first_solids(scene: LevelScene, poses: Mapping[int, Pose]) -> dict[int, Solid]:
+    """Return the objects that have moved as they stood in the first state."""
+    level, solids = scene.level_from_world, {}
+    for number in poses.keys() & scene.solids.keys():
+        back = level @ invert(poses[number]) @ invert(level)
+        points = transform(back, scene.solids[number].points_m)
+        base = float(points[:, 2].min())
+        solids[number] = make_solid(number, points, base_m=base, eye_m=scene.eye_m)
+    return {number: solid for number, solid in solids.items() if solid is not None}
 
 
 def _motion(walk: Walk, scene: LevelScene) -> Motion:

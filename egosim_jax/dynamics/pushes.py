@@ -37,6 +37,8 @@ DESCENT = 0.15
 """Descent per horizontal motion from which an open hand comes down on an object."""
 FACING = 0.4
 """Component of a normal along the opening of a hand from which a side of an object faces a tip."""
+RESTS_M = 0.001
+"""Motion between two frames below which a hand rests, and pushes nothing, in meters."""
 STEP_M = 0.006
 """Maximum motion of a joint between two contacts, in meters."""
 MAX_STEPS = 16
@@ -62,6 +64,9 @@ def push(walk: Walk) -> None:
         if walk.frame == 1 or not track.present[walk.frame - 2]:
             _appear(walk, hand, before)
         length = float(np.linalg.norm(after - before, axis=-1).max())
+        if length < RESTS_M:  # what another hand brings to it, it lets in
+            _appear(walk, hand, after)
+            continue
         steps = int(np.clip(np.ceil(length / STEP_M), 1, MAX_STEPS))
         for number in walk.solids:
             if _may_push(walk, hand, number, length):
@@ -96,12 +101,20 @@ def _fingers(kind: Kind) -> Bool[np.ndarray, " p"]:
 
 
 def _appear(walk: Walk, hand: int, joints_m: Float[np.ndarray, "j 3"]) -> None:
-    """Note the points that are inside objects when a hand appears."""
+    """Note the points that are inside objects when a hand appears.
+
+    A hand that is around an object in the first frame released it before.
+    """
     track = walk.tracks[hand]
     points = _touching(track.kind) @ joints_m
     for number, solid in walk.solids.items():
-        inside = solid.distance(points, walk.poses[number]) < _flesh_m(track)
-        walk.pressing |= {(hand, int(point), number) for point in np.flatnonzero(inside)}
+        pinch, *gaps = solid.distance(
+            np.concatenate([track.pinch_m[walk.frame - 1][None], points]), walk.poses[number]
+        )
+        inside = np.flatnonzero(np.array(gaps) < _flesh_m(track))
+        walk.pressing |= {(hand, int(point), number) for point in inside}
+        if walk.frame == 1 and pinch < LEAVE_M[1]:
+            walk.left.add((hand, number))
 
 
 def _may_push(walk: Walk, hand: int, number: int, length_m: float) -> bool:
@@ -199,7 +212,8 @@ def push_out(
         if distances[deepest] >= flesh_m - 1e-6:
             break
         distance, normal = solid.normal(points_m[deepest], now)
-        if abs(normal[2]) > STEEP:
+        top = float(transform(now, solid.corners_m)[:, 2].max())
+        if abs(normal[2]) > STEEP or points_m[deepest, 2] > top - flesh_m:  # it glances off
             pressing[deepest] = True
             continue
         step = _slide(solid, now, points_m[deepest], normal, flesh_m - distance)
