@@ -103,7 +103,7 @@ def _fingers(kind: Kind) -> Bool[np.ndarray, " p"]:
 def _appear(walk: Walk, hand: int, joints_m: Float[np.ndarray, "j 3"]) -> None:
     """Note the points that are inside objects when a hand appears.
 
-    A hand that is around an object in the first frame released it before.
+    A hand that is around an object in the first frame may have released it before.
     """
     track = walk.tracks[hand]
     points = _touching(track.kind) @ joints_m
@@ -114,7 +114,7 @@ def _appear(walk: Walk, hand: int, joints_m: Float[np.ndarray, "j 3"]) -> None:
         inside = np.flatnonzero(np.array(gaps) < _flesh_m(track))
         walk.pressing |= {(hand, int(point), number) for point in inside}
         if walk.frame == 1 and pinch < LEAVE_M[1]:
-            walk.left.add((hand, number))
+            walk.around.add((hand, number))
 
 
 def _may_push(walk: Walk, hand: int, number: int, length_m: float) -> bool:
@@ -153,6 +153,7 @@ def _push_one(
             walk.pressing.discard((hand, int(point), number))
         if not inside.any():
             walk.left.discard((hand, number))
+            walk.around.discard((hand, number))
     entering = [
         int(point)
         for point in np.flatnonzero(inside)
@@ -160,7 +161,7 @@ def _push_one(
     ]
     if not entering:
         return
-    if (hand, number) in walk.left:
+    if (hand, number) in walk.left | walk.around:
         presses = set(entering)
     else:
         yields = _yields(walk, hand, number, weights @ way_m)

@@ -82,6 +82,8 @@ class Walk:
     """Causes of each object's motion so far."""
     left: set[tuple[int, int]] = field(default_factory=set)
     """Hands and the objects that they have released and not left yet."""
+    around: set[tuple[int, int]] = field(default_factory=set)
+    """Hands and the objects that they are around since the first frame; they may grip them."""
     pressing: set[tuple[int, int, int]] = field(default_factory=set)
     """Hand, joint and object of each joint inside an object that it does not push."""
 
