@@ -62,6 +62,7 @@ def test_the_widened_model_is_its_base_until_it_is_trained(released, converted):
     assert not kernel[33:].any()
 
 
+@pytest.mark.slow
 def test_conversion_is_verified_value_by_value_and_by_a_forward(released, converted, capsys):
     command = f"verify {released} {converted} --config dwm_tiny --widen polarity"
     assert egosim_convert(command.split()) == 0

@@ -158,6 +158,7 @@ def encoded_by_theirs(theirs, inputs):
     return text * mask[..., None], image, (latents - mean) / std, mean, std
 
 
+@pytest.mark.slow
 def test_ten_steps_and_the_frames_are_those_of_diffusers(converted, theirs, triplet):
     inputs = pack([triplet], CONFIG)
     generator = Generator(CONFIG, converted)

@@ -6,6 +6,7 @@ from functools import cache, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from flax import nnx
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -59,6 +60,7 @@ def in_chunks(run, x, sizes):
     return jnp.concatenate(pieces, axis=1)
 
 
+@pytest.mark.slow
 @settings(max_examples=3)
 @given(st.sampled_from([(1, 1), (1, 2), (2, 1)]))
 def test_any_chunks_of_latents_decode_to_the_same_video(sizes):

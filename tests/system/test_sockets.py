@@ -101,8 +101,8 @@ def test_training_listens_on_the_loopback_alone(tmp_path, count):
 
 def test_the_workers_of_a_command_listen_nowhere(tmp_path):
     """`test_secrets.py` has other commands."""
-    options = ["data", "make", "tabletop", "--scenes", "2", "--out", str(tmp_path / "out")]
-    command = [sys.executable, "-m", "egosim_jax.cli", *options]
+    options = "data make tabletop --scenes 2 --frames 5 --height 32 --width 48 --fps 16 --out"
+    command = [sys.executable, "-m", "egosim_jax.cli", *options.split(), str(tmp_path / "out")]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     assert seen_while([subprocess.Popen(command, cwd=ROOT, **quiet)]) == set()
 

@@ -10,6 +10,7 @@ import jax
 import pytest
 
 from egosim_jax.train import distributed
+from egosim_jax.types import InputError
 
 
 def resolve_hostname(monkeypatch, address):
@@ -74,6 +75,22 @@ def test_gloo_beyond_the_loopback_is_said_once(initialized, monkeypatch, address
         with distributed.distributed_context():
             pass
     assert [address in str(warning.message) for warning in said] == [True] * warned
+
+
+@pytest.mark.usefixtures("initialized")
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ((None, "2", None), "JAX_COORDINATOR_ADDRESS, JAX_PROCESS_ID is not"),
+        (("127.0.0.1:1", "2", "2"), "JAX_PROCESS_ID=2"),
+    ],
+)
+def test_an_incomplete_or_invalid_process_environment_is_refused(monkeypatch, given, said):
+    for name, value in zip(distributed.NAMES, given, strict=True):
+        if value is not None:
+            monkeypatch.setenv(name, value)
+    with pytest.raises(InputError, match=said), distributed.distributed_context():
+        pass
 
 
 def test_the_only_task_of_a_machine_has_all_of_its_gpus(monkeypatch):

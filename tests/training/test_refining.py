@@ -46,6 +46,7 @@ def test_the_decoder_alone_is_trained_on_request():
     }
 
 
+@pytest.mark.slow
 def test_lpips_is_added_to_the_loss_of_autoencoding():
     vae = nnx.jit(lambda: VAE.build(rngs=nnx.Rngs(0)))()
     crop = np.random.default_rng(0).integers(0, 256, (1, 5, 32, 32, 3), np.uint8)

@@ -33,6 +33,7 @@ def run(command, clips):
     return main(args)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("served")
 def test_fetch_generate_and_compare(clips, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -23,6 +23,7 @@ def folder(tmp_path_factory):
     close_workers()
 
 
+@pytest.mark.slow
 def test_depth_is_that_of_transformers_own_pipeline(folder):
     import transformers as hf
 
