@@ -38,8 +38,8 @@ def main(folder: Path) -> None:
     networks = Networks.random(CONFIG, seed=0)
     head = networks.dit.head.linear.kernel
     head[...] = 0.1 * jax.random.normal(jax.random.key(1), head[...].shape)  # not zero
-    networks.save(folder)
-    if convert(["quantize", str(folder), "--out", str(folder / "int8"), "--kind", "int8"]):
+    networks.save(folder / "full")
+    if convert(["quantize", str(folder / "full"), "--out", str(folder / "int8"), "--kind", "int8"]):
         raise SystemExit(1)
     triplets = [random_triplet(CONFIG.video, seed) for seed in range(BATCH)]
     found = {}
@@ -47,7 +47,7 @@ def main(folder: Path) -> None:
         mesh = sizes and make_mesh(
             MeshConfig(**dict(zip(("data", "fsdp", "context"), sizes, strict=True)))
         )
-        generator = Generator(CONFIG, Networks.load(CONFIG, folder, mesh=mesh), mesh)
+        generator = Generator(CONFIG, Networks.load(CONFIG, folder / "full", mesh=mesh), mesh)
         clips = generator.generate(triplets[:count], range(count))
         reusing = Generator(REUSING, generator.networks, mesh)
         for name, model in {"latents": generator, "reused": reusing}.items():
