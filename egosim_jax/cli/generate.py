@@ -209,6 +209,11 @@ class Generate:
             )
         if self.lora is not None and self._weights is None:
             raise InputError(f"--lora needs weights: {self.config} has random ones. (--weights)")
+        if self.activations_8bit and self._weights is None:
+            raise InputError(
+                f"--activations-8bit needs weights in 8 bits: {self.config} has random ones. "
+                "(--weights)"
+            )
         if self.lora is not None and self._weights is not None:
             eight_bit.check_lora(self._weights)
 

@@ -91,15 +91,17 @@ def test_activations_are_rounded_by_the_token(kind):
     x = np.random.default_rng(1).normal(size=(3, 4, WIDE)).astype(np.float32)
     x *= 10.0 ** np.arange(-6, 6).reshape(3, 4, 1)
     x[0, 0] = 0
+    x[0, 1] = 0
+    x[0, 1, 3] = 1e-40  # whose scale would be 0
     largest = np.abs(x).max(-1, keepdims=True)
-    steps = np.where(largest == 0, 1, largest / eight_bit.maximum(DTYPES[kind]))
-    steps = steps.astype(np.float32)
+    steps = largest / np.float32(eight_bit.maximum(DTYPES[kind]))
+    steps = np.maximum(steps, np.finfo(np.float32).tiny)
     scaled = x / steps
     rounded = (np.rint(scaled) if kind == "int8" else scaled).astype(DTYPES[kind])
     want = (rounded.astype(np.float64) * steps) @ kernel + bias
     got = np.asarray(layer(jnp.asarray(x)), np.float64)
     assert (np.abs(got - want) <= 1e-5 * largest * np.abs(kernel).sum(axis=0) + 1e-5).all()
-    np.testing.assert_allclose(got[0, 0], bias, rtol=1e-6)
+    np.testing.assert_allclose(got[0, :2], [bias, bias], rtol=1e-6)
 
 
 @pytest.mark.parametrize("kind", DTYPES)
