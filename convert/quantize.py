@@ -83,7 +83,7 @@ class Quantize:
             add_others(self.out, self.source, student=False)
         if (self.source / STUDENT).exists():
             print(
-                f"{STUDENT} was left out: it is a LoRA of {quote_path(self.source)}. Merge it "
+                f"{STUDENT} was omitted: it is a LoRA of {quote_path(self.source)}. Merge it "
                 "first (egosim convert lora --merge), and quantize the merged weights.",
                 file=sys.stderr,
             )

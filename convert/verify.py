@@ -126,7 +126,7 @@ class Verify:
 
 
 def _report(wrong: Sequence[str]) -> int:
-    """Print what is wrong; return the exit code."""
+    """Print the differences; return the exit code."""
     print(printable("\n".join(wrong)), end="\n" if wrong else "")
     return command.ExitCode.FAILED if wrong else command.ExitCode.DONE
 

@@ -383,8 +383,8 @@ class Networks(nnx.Module):
         layers = weights.layers_in_8_bits(read_safetensors(file)) if file.is_file() else {}
         if activations and file.is_file() and not layers:
             raise InputError(
-                f"8-bit activations need weights in 8 bits, and those of {quote_path(file)} are "
-                "not. Convert them (egosim convert quantize), or omit the option. "
+                f"8-bit activations need weights in 8 bits, and {quote_path(file)} has others. "
+                "Convert them (egosim convert quantize), or omit the option. "
                 "(--activations-8bit)"
             )
         eight_bit.adapt(network, layers, activations=activations is not None)

@@ -210,7 +210,7 @@ def layers_in_8_bits(tensors: Mapping[str, Any]) -> dict[str, np.dtype]:
 def check_not_in_8_bits(folder: Path, networks: Collection[str], *, use: str, fix: str) -> None:
     """Raise `InputError` if a network of a weights folder is in 8 bits.
 
-    `use` says what is not possible then, and `fix` what to do.
+    `use` says why that is an error, and `fix` how to correct it.
     """
     for file in (folder / f"{name}.safetensors" for name in networks):
         if file.is_file() and layers_in_8_bits(read_safetensors(file)):
@@ -228,7 +228,7 @@ def check_trainable(folder: Path, networks: Collection[str] | None = None) -> No
 def add_others(folder: Path, origin: Path, *, student: bool = True) -> None:
     """Give a weights folder the networks and tokenizer of `origin` that it lacks; record hashes.
 
-    Without `student`, the LoRA of a student is left out.
+    Without `student`, the LoRA of a student is omitted.
     """
     paths = [
         path

@@ -112,7 +112,7 @@ def quantized_rows(x: Float[Array, "*b i"], dtype: Any) -> tuple[Array, Float[Ar
     """Return activations in 8 bits, and the scale of each row, in float32."""
     x, limit = x.astype(jnp.float32), maximum(np.dtype(dtype))
     largest = jnp.abs(x).max(-1, keepdims=True)
-    # A row of zeros has a scale, too. That of a row with NaN is NaN, and so is the product.
+    # A row of zeros has a scale, too. The scale of a row with NaN is NaN, and so is the product.
     scales = jnp.maximum(largest / limit, jnp.finfo(jnp.float32).tiny)
     values = jnp.clip(x / scales, -limit, limit)
     return (jnp.rint(values) if dtype == jnp.int8 else values).astype(dtype), scales

@@ -1,4 +1,4 @@
-"""What weights in 8 bits cost in quality, on the shipped model.
+"""Quality of samples with weights in 8 bits, on the shipped model.
 
     python -m tests.benchmarks.bench_eight_bit [--clips 2] [--steps 50] [--scale 2]
 

@@ -80,7 +80,7 @@ def held_out(model: ModelConfig, clips: int) -> list[Triplet]:
 
 
 def distances(metric: lpips.Lpips, sample: Sample, whole: Sample) -> str:
-    """Return the cells of the distance of latents and frames to those of the full sampling."""
+    """Return the cells of the distance of latents and frames to the full sampling."""
     (latents, frames), (all_latents, all_frames) = sample, whole
     error = np.linalg.norm(latents - all_latents) / np.linalg.norm(all_latents)
     mse = np.square(frames.astype(float) - all_frames).mean(axis=(1, 2, 3, 4))

@@ -177,7 +177,7 @@ def test_a_set_in_8_bits_is_not_trained_and_takes_no_lora(source, tmp_path):
     weights.check_trainable(source)
 
 
-def test_the_lora_of_a_student_is_left_out(tmp_path, capsys):
+def test_the_lora_of_a_student_is_omitted(tmp_path, capsys):
     ours(tmp_path / "source", *NETWORKS)
     (tmp_path / "source" / weights.STUDENT).write_bytes(b"a LoRA")
     assert quantize(tmp_path / "source", tmp_path / "out") == 0
