@@ -297,7 +297,7 @@ def place(folder: Path, abstract: nnx.State, shardings: nnx.State) -> nnx.State:
     placed = []
     for network, leaves in groupby(nnx.to_flat_state(abstract), key=lambda item: item[0][0]):
         file = folder / f"{network}.safetensors"
-        check_trainable(folder, [network])
+        check_trainable(folder, [str(network)])
         wanted = {".".join(map(str, path[1:])): (path, leaf) for path, leaf in leaves}
         tensors = _read(file)
         shapes = {name: tuple(leaf.shape) for name, (_, leaf) in wanted.items()}
