@@ -13,5 +13,6 @@ Networks belong in `models`, bounded readers of foreign files in `io.untrusted` 
     finite        values that no weight may have
     lora          `read_lora`: LoRA files in every common naming
     lora_export   LoRA files for ComfyUI and diffusers, and DWM's checkpoints
+    quantize      weights in 8 bits
     verify        comparison of converted weights, and of one forward with PyTorch's
 """

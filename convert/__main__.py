@@ -10,11 +10,19 @@ import sys
 from collections.abc import Sequence
 
 from egosim_jax.convert.commands import Inspect, Lora, ToTorch, Weights
+from egosim_jax.convert.quantize import Quantize
 from egosim_jax.convert.verify import Verify
 from egosim_jax.runtime import command
 
 Commands = command.subcommands(
-    {"inspect": Inspect, "weights": Weights, "lora": Lora, "to-torch": ToTorch, "verify": Verify}
+    {
+        "inspect": Inspect,
+        "weights": Weights,
+        "lora": Lora,
+        "quantize": Quantize,
+        "to-torch": ToTorch,
+        "verify": Verify,
+    }
 )
 
 

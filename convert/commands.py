@@ -27,7 +27,7 @@ from egosim_jax.io.atomic import atomic_folder, lock_folder
 from egosim_jax.io.bounded import quote_path
 from egosim_jax.io.mapped import OURS
 from egosim_jax.io.run import write_json
-from egosim_jax.io.weights import add_others, hashes
+from egosim_jax.io.weights import add_others, check_not_in_8_bits, hashes
 from egosim_jax.runtime import command
 from egosim_jax.runtime.terminal import make_console, printable
 from egosim_jax.types import InputError
@@ -203,6 +203,7 @@ class ToTorch:
 
         config = configs.get(self.config)
         apart(self.out, self.weights)
+        _check_not_in_8_bits(self.weights, self.only or tuple(config.networks))
         planned = []
         for name in self.only or tuple(config.networks):
             network = network_config(config, name)
@@ -270,6 +271,8 @@ class Lora:
         for source in (self.source, self.merge):
             if source is not None:
                 apart(self.out, source)
+        if self.merge is not None:
+            _check_not_in_8_bits(self.merge, ["dit"])
         base = {_hash(folder) for folder in (self.merge, self.base) if folder is not None}
         if base:
             check_base(self.source, base)
@@ -322,6 +325,12 @@ class Lora:
                 "them. (--base)"
             )
         return {self.out: (in_memory(lora.tensors(changes)), ours | trained_on)}
+
+
+def _check_not_in_8_bits(folder: Path, networks: Sequence[str]) -> None:
+    """Raise `InputError` if a network of a weights folder is in 8 bits."""
+    use = "cannot be converted further"
+    check_not_in_8_bits(folder, networks, use=use, fix="Give the weights that they were made of.")
 
 
 def _hash(folder: Path) -> str:

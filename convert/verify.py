@@ -7,7 +7,7 @@ the comparison checks sizes and arithmetic but not names.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -19,12 +19,13 @@ import tyro
 
 from egosim_jax.convert.detect import DetectedNetwork, detect
 from egosim_jax.convert.plan import network_config, to_jax, to_torch, widening_of
+from egosim_jax.convert.quantize import SOURCE, quantized_weights, sources_of
 from egosim_jax.convert.tables import Comparison, Reader, Reference
 from egosim_jax.convert.widen import Widening, WidenMode
 from egosim_jax.convert.writer import Weight, in_rows
-from egosim_jax.io.bounded import quote_path
-from egosim_jax.io.mapped import Tensor, read_safetensors
-from egosim_jax.io.weights import WeightsError, fill, flat_shapes, mismatches
+from egosim_jax.io.bounded import quote_path, quote_text
+from egosim_jax.io.mapped import Tensor, read_metadata, read_safetensors, read_weights_hash
+from egosim_jax.io.weights import WeightsError, fill, flat_shapes, hashes, mismatches
 from egosim_jax.runtime import command
 from egosim_jax.runtime.progress import track
 from egosim_jax.runtime.terminal import printable
@@ -32,6 +33,7 @@ from egosim_jax.types import InputError
 
 if TYPE_CHECKING:
     from egosim_jax.models import NetworkConfig
+    from egosim_jax.models.eight_bit import Kind
 
 TOLERANCE = 1e-4
 """Maximum relative L2 error in float32 of two layers, or of a complete autoencoder."""
@@ -49,7 +51,8 @@ class Verify:
     """
 
     source: Annotated[Path, tyro.conf.Positional]
-    """File in .safetensors or .pth format, or folder of them."""
+    """File in .safetensors or .pth format, or folder of them; of weights in 8 bits, their source.
+    """
     weights: Annotated[Path, tyro.conf.Positional]
     """Weights folder converted from it."""
     config: str
@@ -64,6 +67,8 @@ class Verify:
         from egosim_jax import configs
 
         config = configs.get(self.config)
+        if sources := sources_of(self.source, self.weights):
+            return self._verify_8_bits(sources)
         has_pytorch = all(map(find_spec, LIBRARIES))
         wrong = []
         folder = detect(self.source, config).only(self.prefix)
@@ -82,20 +87,8 @@ class Verify:
             # `_same` casts each piece to the dtype in the file: any dtype does here.
             weights = to_jax(found, config, dtype="float32", widening=widening)
             tensors = read_safetensors(file)
-            if problems := mismatches(tensors, {w.name: w.shape for w in weights}):
-                raise WeightsError(problems, source=str(file))
-            damaged = [name for name, tensor in tensors.items() if not tensor.intact]
-            wrong += [f"{found.network}: {name} does not match its checksum" for name in damaged]
-            if not any(tensor.checksum for tensor in tensors.values()):
-                print(f"{found.network}: no checksums; converting again adds them")
-            differ = [
-                weight.name
-                for weight in track(weights, f"comparing {found.network}", total=len(weights))
-                if weight.name not in damaged and not _same(weight, tensors[weight.name])
-            ]
-            equal = len(weights) - len(differ) - len(damaged)
-            print(f"{found.network}: {equal} of {len(weights)} weights equal")
-            wrong += [f"{found.network}: {name} differs" for name in differ]
+            differ, damaged = _compare(found.network, weights, tensors, file)
+            wrong += damaged + differ
             reference = found.table.reference
             if reference is None:
                 print(f"{found.network}: no forward compared: its table has no reference")
@@ -107,8 +100,57 @@ class Verify:
                     wrong.append(f"{found.network}: forward differs by more than rounding")
         if not has_pytorch:
             print(f"no forward compared: that needs {', '.join(LIBRARIES)}")
-        print(printable("\n".join(wrong)), end="\n" if wrong else "")
-        return command.ExitCode.FAILED if wrong else command.ExitCode.DONE
+        return _report(wrong)
+
+    def _verify_8_bits(self, sources: Mapping[str, tuple[Path, Kind]]) -> int:
+        """Quantize the sources again, and compare; return 1 if any weight differs."""
+        wrong = []
+        for name, (source, kind) in sources.items():
+            file = self.weights / source.name
+            if (origin := read_metadata(file).get(SOURCE)) not in (None, read_weights_hash(source)):
+                wrong.append(f"{name}: made of weights with the hash {quote_text(origin[:12])}")
+            weights = quantized_weights(source, kind)
+            differ, damaged = _compare(name, weights, read_safetensors(file), file)
+            wrong += damaged + differ
+        for name, digest in hashes(self.source).items():
+            file = self.weights / f"{name}.safetensors"
+            if name in sources or not file.exists():
+                continue
+            tensors = read_safetensors(file)
+            damaged = [path for path, tensor in tensors.items() if not tensor.intact]
+            wrong += [f"{name}: {path} does not match its checksum" for path in damaged]
+            if read_weights_hash(file) != digest:
+                wrong.append(f"{name}: is not the network of {quote_path(self.source)}")
+            print(f"{name}: not in 8 bits")
+        return _report(wrong)
+
+
+def _report(wrong: Sequence[str]) -> int:
+    """Print the differences; return the exit code."""
+    print(printable("\n".join(wrong)), end="\n" if wrong else "")
+    return command.ExitCode.FAILED if wrong else command.ExitCode.DONE
+
+
+def _compare(
+    network: str, weights: Sequence[Weight], tensors: Mapping[str, Tensor], file: Path
+) -> tuple[list[str], list[str]]:
+    """Return lines about the weights of a file that differ, and about those that are damaged."""
+    if problems := mismatches(tensors, {w.name: w.shape for w in weights}):
+        raise WeightsError(problems, source=str(file))
+    damaged = [name for name, tensor in tensors.items() if not tensor.intact]
+    if not any(tensor.checksum for tensor in tensors.values()):
+        print(f"{network}: no checksums; converting again adds them")
+    differ = [
+        weight.name
+        for weight in track(weights, f"comparing {network}", total=len(weights))
+        if weight.name not in damaged and not _same(weight, tensors[weight.name])
+    ]
+    equal = len(weights) - len(differ) - len(damaged)
+    print(f"{network}: {equal} of {len(weights)} weights equal")
+    return (
+        [f"{network}: {name} differs" for name in differ],
+        [f"{network}: {name} does not match its checksum" for name in damaged],
+    )
 
 
 def _same(weight: Weight, tensor: Tensor) -> bool:

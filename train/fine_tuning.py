@@ -115,13 +115,14 @@ class FineTuning(Recipe):
     def train(self) -> int:
         """Check the latents, train, and write the weights."""
         out, latents, weights = self.require("out", "latents", "weights")
-        from egosim_jax.io.weights import check_folder
+        from egosim_jax.io.weights import check_folder, check_trainable
         from egosim_jax.train.encode import check_encoders
         from egosim_jax.train.loop import train
         from egosim_jax.train.monitor import Samples
 
         model = self.model()
         check_folder(weights, model.name)
+        check_trainable(weights)
         lora = self.check_lora(weights)
         latents = self._local_shards(latents)
         validation = None if self.validation is None else self._local_shards(self.validation)

@@ -119,10 +119,13 @@ class FromScratch(Recipe):
         check_counts({"--stride": self.stride})
         from egosim_jax.configs.model import Networks
         from egosim_jax.io.run import open_folder
+        from egosim_jax.io.weights import check_trainable
         from egosim_jax.train.loop import phase0, train
         from egosim_jax.train.monitor import Samples
 
         require_single_process(self.config)
+        if self.weights is not None:
+            check_trainable(self.weights)
         has_data = any((out / made).exists() for made in ("clips", "frames", "weights"))
         open_folder(out, self, mutable=self._mutable(out), begun=has_data)
         frames = self.frames(out)

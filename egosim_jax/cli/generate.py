@@ -41,6 +41,7 @@ class Generate:
             "guidance",
             "guidance_interval",
             "cache",
+            "activations_8bit",
             "lora",
             "lora_scale",
             "baseline",
@@ -108,6 +109,8 @@ class Generate:
     """Reuse a step's prediction while its estimated relative error is below this, such as 0.05.
 
     Without it every step is exact (docs/performance.md, "Fewer forward passes")."""
+    activations_8bit: bool = False
+    """Compute the products of 8-bit weights with 8-bit activations (`egosim convert quantize`)."""
     seed: int = 0
     """Seed of the noise and, without --metadata, of the first scene."""
     batch_size: int | None = None
@@ -181,6 +184,8 @@ class Generate:
         return ExitCode.PARTIAL if outcome.rejected or outcome.failed else ExitCode.DONE
 
     def _check(self) -> None:
+        from egosim_jax.models import eight_bit
+
         check_counts(
             {"--steps": self.steps, "--batch-size": self.batch_size, "--limit": self.limit}
         )
@@ -204,6 +209,13 @@ class Generate:
             )
         if self.lora is not None and self._weights is None:
             raise InputError(f"--lora needs weights: {self.config} has random ones. (--weights)")
+        if self.activations_8bit and self._weights is None:
+            raise InputError(
+                f"--activations-8bit needs weights in 8 bits: {self.config} has random ones. "
+                "(--weights)"
+            )
+        if self.lora is not None and self._weights is not None:
+            eight_bit.check_lora(self._weights)
 
     def _windows(self, metadata: Path) -> Sequence[Window]:
         from egosim_jax.data.metadata import read_metadata, select
@@ -249,6 +261,8 @@ class Generate:
             )
         if self.cache is not None:
             config = replace(config, cache=StepCache(threshold=self.cache))
+        if self.activations_8bit:
+            config = replace(config, activations="8bit")
         if self.solver is not None:
             config = replace(config, solver=SOLVERS.parse(self.solver))
         if self.solver == "wan":

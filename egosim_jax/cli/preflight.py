@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from math import prod
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.types import InputError, MeshConfig, check_counts
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from jax.sharding import Mesh
 
     from egosim_jax.configs.model import ModelConfig
+    from egosim_jax.models.eight_bit import Kind
     from egosim_jax.preflight.report import OutOfMemory, Report
     from egosim_jax.preflight.targets import Target
 
@@ -49,6 +50,10 @@ class Preflight:
 
     Less time for one clip: --mesh.data 1 --mesh.context -1. Weights too large for one device:
     --mesh.data 1 --mesh.fsdp -1."""
+    weights_8bit: Literal["int8", "float8"] | None = None
+    """Weights in 8 bits, as `egosim convert quantize` makes them."""
+    activations_8bit: bool = False
+    """Compute the products of 8-bit weights with 8-bit activations."""
     json: bool = False
     """Print the reports as JSON."""
 
@@ -71,10 +76,16 @@ class Preflight:
             config = replace(config, chunks=chunks)
         elif self.first_steps is not None:
             raise InputError("--first-steps needs chunks: give their sizes. (--chunks)")
+        if self.activations_8bit:
+            if self.weights_8bit is None:
+                raise InputError("--activations-8bit needs weights in 8 bits. (--weights-8bit)")
+            config = replace(config, activations="8bit")
         mesh = make_mesh(self.mesh, target.devices)
         size = self.batch_size or parts("batch", mesh)
         by_program = {}
-        for name, report in compile_generation(config, target, mesh, size):
+        for name, report in compile_generation(
+            config, target, mesh, size, weights=self.weights_8bit
+        ):
             by_program[name] = report
             if not self.json:
                 text = reports.text(report)
@@ -89,24 +100,41 @@ class Preflight:
 
 
 def compile_generation(
-    config: ModelConfig, target: Target, mesh: Mesh, size: int
+    config: ModelConfig,
+    target: Target,
+    mesh: Mesh,
+    size: int,
+    *,
+    weights: Kind | None = None,
 ) -> Iterator[tuple[str, Report | OutOfMemory]]:
-    """Yield the report of each program of generation, with the weights of all networks resident."""
+    """Yield the report of each program of generation, with the weights of all networks resident.
+
+    `weights` is the kind of weights in 8 bits; None: all are in the compute dtype.
+    """
     from flax import nnx
 
     from egosim_jax.configs.model import Networks
     from egosim_jax.generation.generator import Generator
+    from egosim_jax.io.weights import flat_shapes
+    from egosim_jax.models import eight_bit
     from egosim_jax.preflight.report import compile_for
 
     networks = Networks.abstract(config)
     for name, network in networks.parts().items():
-        setattr(networks, name, _stored(network, getattr(config, name).dtype))
+        stored = _stored(network, getattr(config, name).dtype)
+        setattr(networks, name, stored)
+        if weights is not None and name in eight_bit.NETWORKS:
+            layers = dict.fromkeys(
+                eight_bit.layers_of(flat_shapes(stored)), eight_bit.DTYPES[weights]
+            )
+            activations = name == "dit" and config.activations is not None
+            eight_bit.adapt(stored, layers, activations=activations)
     generator = Generator(config, networks, mesh)
-    weights = _bytes_per_device(nnx.state(generator.networks))
+    resident = _bytes_per_device(nnx.state(generator.networks))
     for name, program, given in generator.programs(size):
         if name == "noise":  # negligible: it only fills an array of the latents' size
             continue
-        yield name, compile_for(target, program.trace(*given), resident=weights)
+        yield name, compile_for(target, program.trace(*given), resident=resident)
 
 
 def _stored(network: nnx.Module, dtype: str) -> nnx.Module:

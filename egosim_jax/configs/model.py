@@ -22,7 +22,9 @@ from egosim_jax.diffusion.guidance import Guidance
 from egosim_jax.diffusion.process import RectifiedFlow, VariancePreserving
 from egosim_jax.diffusion.solver import Euler, Solver
 from egosim_jax.io import weights
+from egosim_jax.io.bounded import quote_path
 from egosim_jax.io.executables import cached_trace
+from egosim_jax.io.mapped import read_safetensors
 from egosim_jax.models import (
     CausalDenoiserConfig,
     ChunkedCodecConfig,
@@ -36,6 +38,7 @@ from egosim_jax.models import (
     VideoCodec,
     VideoCodecConfig,
     abstract,
+    eight_bit,
     lora,
 )
 from egosim_jax.models.chunks import Chunks
@@ -114,6 +117,8 @@ class ModelConfig:
     """Reuse of predictions at steps where they would hardly change; None: every step is exact."""
     chunks: Chunks | None = None
     """Chunks that the denoiser makes one after the other, a causal student; None: all at once."""
+    activations: Literal["8bit"] | None = None
+    """Activations of a denoiser with weights in 8 bits: also 8 bits, or None: the compute dtype."""
 
     def __post_init__(self) -> None:
         check_counts({"point_px": self.point_px})
@@ -352,7 +357,8 @@ class Networks(nnx.Module):
 
         On a mesh, each device reads only its own part of the weights. Raises `InputError` with
         every path that is missing, unknown or of another shape, or if the denoiser makes other
-        chunks. A student may be a LoRA of the folder's denoiser, in `student.safetensors`.
+        chunks. A student may be a LoRA of the folder's denoiser, in `student.safetensors`. Linear
+        layers that a file has in 8 bits compute with them (`models/eight_bit.py`).
         """
         networks, folder = cls.abstract(config, only=only), Path(folder)
         if not folder.is_dir():
@@ -363,10 +369,25 @@ class Networks(nnx.Module):
             student = None
             if name == "dit" and file.is_file():
                 student = weights.student_of(file, metadata_of(name, config.chunks))
+                if student is not None:
+                    eight_bit.check_lora(folder)
+            cls._adapt(network, file, config.activations if name == "dit" else None)
             weights.load(file, network, mesh=mesh)
             if student is not None:
                 lora.merge(network, student, base=weights.hashes(folder, only=["dit"])["dit"])
         return networks
+
+    @staticmethod
+    def _adapt(network: nnx.Module, file: Path, activations: str | None) -> None:
+        """Give a network the 8-bit layers of its file, if any."""
+        layers = weights.layers_in_8_bits(read_safetensors(file)) if file.is_file() else {}
+        if activations and file.is_file() and not layers:
+            raise InputError(
+                f"8-bit activations need weights in 8 bits, and {quote_path(file)} has others. "
+                "Convert them (egosim convert quantize), or omit the option. "
+                "(--activations-8bit)"
+            )
+        eight_bit.adapt(network, layers, activations=activations is not None)
 
     def save(self, folder: Path | str, *, dtype: str | None = None) -> None:
         """Write a weights folder, cast to `dtype` if given."""

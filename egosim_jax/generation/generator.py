@@ -58,7 +58,7 @@ from egosim_jax.generation.stream import (
 )
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.run import plain
-from egosim_jax.models import CausalDenoiser, Denoiser
+from egosim_jax.models import CausalDenoiser, Denoiser, eight_bit
 from egosim_jax.rendering import PriorKind, Renderer, jitted
 from egosim_jax.runtime.phases import phase
 from egosim_jax.sharding import fetch, shard_params
@@ -208,6 +208,8 @@ class Generator:
 
         config = configs.get(config) if isinstance(config, str) else config
         folder = configs.weights_of(config.name, None if weights is None else Path(weights))
+        if lora is not None:
+            eight_bit.check_lora(folder)
         with phase(f"loads the weights of {config.name}"):
             networks = Networks.load(config, folder, mesh=mesh)
         if lora is not None:

@@ -14,6 +14,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import ml_dtypes
 import numpy as np
 
 from egosim_jax.io.atomic import atomic_folder, atomic_write
@@ -41,6 +42,8 @@ STUDENT = "student.safetensors"
 """Name of the LoRA in a weights folder that makes its denoiser a causal student."""
 CHUNKS = "chunks"
 """Metadata of a denoiser that is a causal student: the latent frames of its chunks."""
+EIGHT_BITS = (np.dtype(np.int8), np.dtype(ml_dtypes.float8_e4m3fn))
+"""Dtypes of kernels in 8 bits, which have a scale of each output channel next to them."""
 RECORD = "hashes.json"
 """Name of the file with the hashes of the networks that a weights folder has from another one."""
 MAX_LISTED = 12
@@ -197,9 +200,41 @@ def write(
             file.write(bytes_of[name])
 
 
-def add_others(folder: Path, origin: Path) -> None:
-    """Give a weights folder the networks and tokenizer of `origin` that it lacks; record hashes."""
-    paths = [path for path in sorted(origin.glob("[!.]*")) if not (folder / path.name).exists()]
+def layers_in_8_bits(tensors: Mapping[str, Any]) -> dict[str, np.dtype]:
+    """Return the dtype of each linear layer whose kernel is in 8 bits, by path."""
+    paths = [name.removesuffix(".kernel") for name in tensors if name.endswith(".kernel")]
+    dtypes = {path: tensors[f"{path}.kernel"].dtype for path in paths if f"{path}.scale" in tensors}
+    return {path: dtype for path, dtype in dtypes.items() if dtype in EIGHT_BITS}
+
+
+def check_not_in_8_bits(folder: Path, networks: Collection[str], *, use: str, fix: str) -> None:
+    """Raise `InputError` if a network of a weights folder is in 8 bits.
+
+    `use` says why that is an error, and `fix` how to correct it.
+    """
+    for file in (folder / f"{name}.safetensors" for name in networks):
+        if file.is_file() and layers_in_8_bits(read_safetensors(file)):
+            raise InputError(f"{quote_path(file)} has weights in 8 bits, which {use}. {fix}")
+
+
+def check_trainable(folder: Path, networks: Collection[str] | None = None) -> None:
+    """Raise `InputError` if a network of a weights folder, by default any, is in 8 bits."""
+    if networks is None:
+        networks = sorted(path.stem for path in folder.glob("[!.]*.safetensors"))
+    fix = "Train the weights that they were made of, and quantize the result. (--weights)"
+    check_not_in_8_bits(folder, networks, use="cannot be trained", fix=fix)
+
+
+def add_others(folder: Path, origin: Path, *, student: bool = True) -> None:
+    """Give a weights folder the networks and tokenizer of `origin` that it lacks; record hashes.
+
+    Without `student`, the LoRA of a student is omitted.
+    """
+    paths = [
+        path
+        for path in sorted(origin.glob("[!.]*"))
+        if not (folder / path.name).exists() and (student or path.name != STUDENT)
+    ]
     files = [path for path in paths if path.suffix == ".safetensors" and not path.is_dir()]
     # Before the files: whatever is here if this stops has its hash.
     new = {path.stem: read_weights_hash(_linked(path)) for path in files if path.name != STUDENT}
@@ -262,6 +297,7 @@ def place(folder: Path, abstract: nnx.State, shardings: nnx.State) -> nnx.State:
     placed = []
     for network, leaves in groupby(nnx.to_flat_state(abstract), key=lambda item: item[0][0]):
         file = folder / f"{network}.safetensors"
+        check_trainable(folder, [str(network)])
         wanted = {".".join(map(str, path[1:])): (path, leaf) for path, leaf in leaves}
         tensors = _read(file)
         shapes = {name: tuple(leaf.shape) for name, (_, leaf) in wanted.items()}

@@ -9,6 +9,7 @@ satisfy the Protocols of this module.
     CausalDenoiser, Chunks                            denoiser of one chunk of a clip at a time
     wan, cogvideox                                    model families
     lora                                              low-rank adaptation
+    eight_bit                                         linear layers with weights in 8 bits
 """
 
 from __future__ import annotations

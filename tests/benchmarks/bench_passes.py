@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -24,6 +25,7 @@ from egosim_jax.diffusion import Guidance, StepCache
 from egosim_jax.evaluation.metrics import lpips
 from egosim_jax.generation import generator
 from egosim_jax.generation.encoding import pack
+from egosim_jax.types import Triplet
 from egosim_jax.worlds.tabletop import make_sequence
 from egosim_jax.worlds.tabletop.clips import to_triplet
 from egosim_jax.worlds.tabletop.dataset import conditions_of
@@ -31,6 +33,8 @@ from egosim_jax.worlds.tabletop.dataset import conditions_of
 NAME, FIRST_SEED = "tabletop", 700
 THRESHOLDS = (0.02, 0.05, 0.1, 0.2)
 INTERVAL = (200.0, 900.0)
+Sample = tuple[np.ndarray, np.ndarray]
+"""Latents and frames of clips."""
 
 
 def variants(full: ModelConfig, steps: int, scale: float) -> Iterator[tuple[str, ModelConfig]]:
@@ -55,34 +59,46 @@ def main() -> None:
     options = parser.parse_args()
     model = configs.get(NAME)
     full = replace(model, steps=options.steps, guidance=Guidance(scale=options.scale))
-    prior, hands = conditions_of(model)
-    scenes = (
-        next(make_sequence(FIRST_SEED + n, spec=model.video, kind="human"))
-        for n in range(options.clips)
-    )
-    triplets = [to_triplet(c, prior=prior, hands=hands, point_px=model.point_px) for c in scenes]
+    triplets = held_out(model, options.clips)
     metric = lpips.Lpips.load("alex")
     print("| sampling | passes | latents | PSNR | LPIPS |\n| --- | --- | --- | --- | --- |")
     whole = None
     for name, config in variants(full, options.steps, options.scale):
         passes, latents, frames = sampled(config, triplets)
         whole = whole or (latents, frames)
-        error = np.linalg.norm(latents - whole[0]) / np.linalg.norm(whole[0])
-        mse = np.square(frames.astype(float) - whole[1]).mean(axis=(1, 2, 3, 4))
-        far = np.mean(
-            [
-                lpips.frame_distances(metric, a[1::4], b[1::4]).mean()
-                for a, b in zip(frames, whole[1], strict=True)
-            ]
-        )
-        psnr = np.mean(10 * np.log10(255**2 / np.maximum(mse, 1e-9)))
-        shown = "| | |" if not error else f"{error:.3f} | {psnr:.1f} | {far:.4f} |"
+        shown = distances(metric, (latents, frames), whole)
         print(f"| {name} | {passes:.1f} | {shown}", flush=True)
 
 
-def sampled(config: ModelConfig, triplets: list) -> tuple[float, np.ndarray, np.ndarray]:
+def held_out(model: ModelConfig, clips: int) -> list[Triplet]:
+    """Return the conditions of clips of held-out scenes."""
+    prior, hands = conditions_of(model)
+    scenes = (
+        next(make_sequence(FIRST_SEED + n, spec=model.video, kind="human")) for n in range(clips)
+    )
+    return [to_triplet(c, prior=prior, hands=hands, point_px=model.point_px) for c in scenes]
+
+
+def distances(metric: lpips.Lpips, sample: Sample, whole: Sample) -> str:
+    """Return the cells of the distance of latents and frames to the full sampling."""
+    (latents, frames), (all_latents, all_frames) = sample, whole
+    error = np.linalg.norm(latents - all_latents) / np.linalg.norm(all_latents)
+    mse = np.square(frames.astype(float) - all_frames).mean(axis=(1, 2, 3, 4))
+    far = np.mean(
+        [
+            lpips.frame_distances(metric, a[1::4], b[1::4]).mean()
+            for a, b in zip(frames, all_frames, strict=True)
+        ]
+    )
+    psnr = np.mean(10 * np.log10(255**2 / np.maximum(mse, 1e-9)))
+    return "| | |" if not error else f"{error:.3f} | {psnr:.1f} | {far:.4f} |"
+
+
+def sampled(
+    config: ModelConfig, triplets: list[Triplet], weights: Path | None = None
+) -> tuple[float, np.ndarray, np.ndarray]:
     """Return the mean number of forward passes of a clip, the latents and the frames."""
-    sampler = egosim.Generator.load(config, configs.shipped_weights(NAME))
+    sampler = egosim.Generator.load(config, weights or configs.shipped_weights(NAME))
     network, passes = sampler.networks.dit, 0
 
     class Counted:

@@ -14,8 +14,8 @@ pytestmark = [
 ]
 ROOT = Path(__file__).parents[2]
 WRITERS = (
-    "snapshot points portrait sheet video journal results config weights to-torch lora merge pack "
-    "overwrite encode make executables checkpoint"
+    "snapshot points portrait sheet video journal results config weights to-torch quantize lora "
+    "merge pack overwrite encode make executables checkpoint"
 )
 
 

@@ -340,6 +340,13 @@ WRITERS = {
         ),
         _weights,
     ),
+    "quantize": Writer(
+        lambda place, inputs, version: _run(
+            egosim_convert,
+            f"quantize {inputs}/weights --out {place}/out --kind {('int8', 'float8')[version]}",
+        ),
+        _weights,
+    ),
     "lora": Writer(
         lambda place, inputs, version: _run(
             egosim_convert,

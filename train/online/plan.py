@@ -11,6 +11,7 @@ from typing import Any
 from egosim_jax import configs
 from egosim_jax.conditioning.condition import ConditionDropout
 from egosim_jax.configs.model import ModelConfig
+from egosim_jax.io.weights import check_trainable
 from egosim_jax.train.tasks.few_steps import FewSteps
 from egosim_jax.train.tasks.refining import Refining
 from egosim_jax.types import InputError, check_counts
@@ -95,8 +96,10 @@ class OnlineTraining:
 
     @property
     def start(self) -> Path:
-        """Folder of the weights to start from. Raises `InputError` without any."""
-        return configs.weights_of(self.config, self.weights)
+        """Folder of the weights to start from. Raises `InputError` without any, or in 8 bits."""
+        folder = configs.weights_of(self.config, self.weights)
+        check_trainable(folder)
+        return folder
 
     @property
     def denoising(self) -> FewSteps:

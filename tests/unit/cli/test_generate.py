@@ -26,12 +26,25 @@ def test_a_lora_of_other_weights_is_refused(debug_weights, tmp_path, capsys):
     assert "was trained on other weights" in capsys.readouterr().err
 
 
+def test_a_lora_of_weights_in_8_bits_is_refused(debug_weights, tmp_path, capsys):
+    narrow = tmp_path / "int8"
+    quantize = ["quantize", str(debug_weights), "--out", str(narrow), "--kind", "int8"]
+    assert main(["convert", *quantize]) == ExitCode.DONE
+    options = ["--weights", str(narrow), "--lora", str(tmp_path / "lora.safetensors")]
+    code = main(["generate", "--config", "debug", "--out", str(tmp_path / "out"), *options])
+    assert code == ExitCode.USAGE
+    said = " ".join(capsys.readouterr().err.split())
+    assert "take no LoRA" in said
+    assert "egosim convert lora --merge" in said
+
+
 @pytest.mark.parametrize(
     ("options", "named"),
     [
         (["--lora-scale", "0.5"], "(--lora)"),
         (["--metadata", "a.csv", "--robot"], "(--robot, --metadata)"),
         (["--solver", "eulr"], "(--solver)"),
+        (["--activations-8bit"], "(--weights)"),
     ],
 )
 def test_options_that_cannot_be_are_refused(tmp_path, capsys, options, named):

@@ -9,6 +9,7 @@ import numpy as np
 
 from egosim_jax import configs
 from egosim_jax.configs.model import Networks
+from egosim_jax.convert.__main__ import main as convert
 from egosim_jax.diffusion import StepCache
 from egosim_jax.generation.generator import Generator
 from egosim_jax.models.wan.dit import WanDiTConfig
@@ -37,19 +38,29 @@ def main(folder: Path) -> None:
     networks = Networks.random(CONFIG, seed=0)
     head = networks.dit.head.linear.kernel
     head[...] = 0.1 * jax.random.normal(jax.random.key(1), head[...].shape)  # not zero
-    networks.save(folder)
+    networks.save(folder / "full")
+    if convert(["quantize", str(folder / "full"), "--out", str(folder / "int8"), "--kind", "int8"]):
+        raise SystemExit(1)
     triplets = [random_triplet(CONFIG.video, seed) for seed in range(BATCH)]
     found = {}
     for sizes, count in {None: BATCH, **MESHES}.items():
         mesh = sizes and make_mesh(
             MeshConfig(**dict(zip(("data", "fsdp", "context"), sizes, strict=True)))
         )
-        generator = Generator(CONFIG, Networks.load(CONFIG, folder, mesh=mesh), mesh)
+        generator = Generator(CONFIG, Networks.load(CONFIG, folder / "full", mesh=mesh), mesh)
         clips = generator.generate(triplets[:count], range(count))
         reusing = Generator(REUSING, generator.networks, mesh)
         for name, model in {"latents": generator, "reused": reusing}.items():
             latents = model.latents(triplets[:count], range(count))
             found[f"{sizes} {name}"] = np.asarray(latents)
+        narrow = Networks.load(CONFIG, folder / "int8", mesh=mesh)
+        found[f"{sizes} int8"] = np.asarray(
+            Generator(CONFIG, narrow, mesh).latents(triplets[:count], range(count))
+        )
+        layer = narrow.dit.blocks.mlp.down
+        for name, weight in {"kernel": layer.kernel, "scale": layer.scale}.items():
+            (shape,) = {shard.data.shape for shard in weight.get_value().addressable_shards}
+            found[f"{sizes} shard of {name}"] = np.array(shape)
         found[f"{sizes} frames"] = np.stack([clip.frames for clip in clips])
     generator = Generator(CONFIG, networks, make_mesh(MeshConfig(data=4, fsdp=2)))
     try:

@@ -30,7 +30,7 @@ def test_clips_of_a_mesh_are_those_of_one_device(found):
     """In float32: sums are taken in another order."""
     for mesh in ("(4, 2, 1)", "(1, 1, 8)"):
         frames = found[f"{mesh} frames"].astype(int)
-        for name in ("latents", "reused"):
+        for name in ("latents", "reused", "int8"):
             latents = found[f"{mesh} {name}"]
             alone = found[f"None {name}"][: len(latents)]
             assert np.linalg.norm(latents - alone) / np.linalg.norm(alone) <= 1e-5
@@ -39,3 +39,12 @@ def test_clips_of_a_mesh_are_those_of_one_device(found):
 
 def test_a_batch_that_the_mesh_does_not_divide_is_refused(found):
     assert "A batch of 6 cannot be shared by a mesh of data 4 x fsdp 2" in str(found["refusal"])
+
+
+def test_kernels_and_scales_in_8_bits_are_split_over_the_same_axis(found):
+    assert np.linalg.norm(found["None int8"] - found["None latents"]) > 0
+    for name, whole in {"kernel": (2, 96, 64), "scale": (2, 64)}.items():
+        assert tuple(found[f"None shard of {name}"]) == whole
+        for mesh, parts in {"(4, 2, 1)": 2, "(1, 1, 8)": 8}.items():
+            shard = (*whole[:-1], whole[-1] // parts)
+            assert tuple(found[f"{mesh} shard of {name}"]) == shard
