@@ -38,6 +38,14 @@ class Preflight:
     """Clips generated together; by default one per group of devices that share a clip."""
     steps: int | None = None
     """Denoising steps, instead of the model's."""
+    guidance: float | None = None
+    """Scale of the guidance on the text, instead of the model's; not 1: two passes a step."""
+    computed: float | None = None
+    """Share of the steps that run their passes while --cache reuses the others, such as 0.4.
+
+    The share depends on threshold and clip; `tests.benchmarks.bench_passes` counts it."""
+    progressive: float | None = None
+    """Run this share of the steps, the first ones, on half the rows and columns of the latents."""
     chunks: tuple[int, ...] = ()
     """Latent frames of each chunk, for a causal student of the model; by default the model's own.
 
@@ -65,7 +73,7 @@ class Preflight:
         compile_offline()
         share_with_jax()
         config, target = configs.get(self.config), find(self.target)
-        config = replace(config, steps=self.steps or config.steps)
+        config = self._sampling(replace(config, steps=self.steps or config.steps))
         if self.chunks:
             chunks = Chunks(sizes=self.chunks, first_steps=self.first_steps)
             config = replace(config, chunks=chunks)
@@ -74,7 +82,9 @@ class Preflight:
         mesh = make_mesh(self.mesh, target.devices)
         size = self.batch_size or parts("batch", mesh)
         by_program = {}
-        for name, report in compile_generation(config, target, mesh, size):
+        for name, report in compile_generation(
+            config, target, mesh, size, computed=self.computed or 1.0
+        ):
             by_program[name] = report
             if not self.json:
                 text = reports.text(report)
@@ -87,11 +97,32 @@ class Preflight:
         fits = all(report.fits for report in by_program.values())
         return ExitCode.DONE if fits else ExitCode.FAILED
 
+    def _sampling(self, config: ModelConfig) -> ModelConfig:
+        """Return the config with the options that save or add forward passes."""
+        from egosim_jax.diffusion import Guidance, Progressive, StepCache
+
+        if self.guidance is not None:
+            config = replace(config, guidance=Guidance(scale=self.guidance))
+        if self.computed is not None:
+            if not 0 < self.computed <= 1:
+                raise InputError(
+                    f"{self.computed:g} is no share of computed steps: it must be above 0 and at "
+                    "most 1. (--computed)"
+                )
+            # The threshold changes neither memory nor FLOPs: the share says what is computed.
+            config = replace(config, cache=StepCache(threshold=0.05))
+        if self.progressive is not None:
+            config = replace(config, progressive=Progressive(share=self.progressive))
+        return config
+
 
 def compile_generation(
-    config: ModelConfig, target: Target, mesh: Mesh, size: int
+    config: ModelConfig, target: Target, mesh: Mesh, size: int, *, computed: float = 1.0
 ) -> Iterator[tuple[str, Report | OutOfMemory]]:
-    """Yield the report of each program of generation, with the weights of all networks resident."""
+    """Yield the report of each program of generation, with the weights of all networks resident.
+
+    `computed` is the share of the steps that a cache does not reuse.
+    """
     from flax import nnx
 
     from egosim_jax.configs.model import Networks
@@ -106,7 +137,7 @@ def compile_generation(
     for name, program, given in generator.programs(size):
         if name == "noise":  # negligible: it only fills an array of the latents' size
             continue
-        yield name, compile_for(target, program.trace(*given), resident=weights)
+        yield name, compile_for(target, program.trace(*given), resident=weights, taken=computed)
 
 
 def _stored(network: nnx.Module, dtype: str) -> nnx.Module:
