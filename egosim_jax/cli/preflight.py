@@ -109,7 +109,7 @@ class Preflight:
                     f"{self.computed:g} is no share of computed steps: it must be above 0 and at "
                     "most 1. (--computed)"
                 )
-            # The threshold changes neither memory nor FLOPs: the share says what is computed.
+            # Any threshold: memory and FLOPs depend on the share alone.
             config = replace(config, cache=StepCache(threshold=0.05))
         if self.progressive is not None:
             config = replace(config, progressive=Progressive(share=self.progressive))

@@ -1,7 +1,7 @@
 """Early steps on half the rows and columns of the latent grid.
 
-At high noise a network decides what is large, for which a coarse grid is enough: it has a quarter
-of the tokens. On the straight path x_t = (1 - t) x0 + t e, with e ~ N(0, 1), the mean over blocks
+At high noise a network lays out the scene, and a coarse grid is enough: it has a quarter of the
+tokens. On the straight path x_t = (1 - t) x0 + t e, with e ~ N(0, 1), the mean over blocks
 of 2 x 2 cells halves the deviation of the noise:
 
     mean x_t = (1 - t) mean x0 + (t / 2) e',   e' = 2 mean e ~ N(0, 1)
@@ -17,7 +17,7 @@ become latents of the whole grid with the detail of the noise e that the clip st
     x_t = (1 - t / 2) repeat(x') + t (e - repeat(mean e))
 
 Both grids so share their noise, and the means of x_t are again the latents of the half grid. The
-noise of x_t has the variance t^2 (1/4 + 3/4). The solver starts anew there, without a memory of the
+noise of x_t has the variance t^2 (1/4 + 3/4). The solver starts again there, without a memory of the
 half grid.
 """
 
@@ -109,7 +109,7 @@ def half_times(times: Float[np.ndarray, " times"]) -> Float[np.ndarray, " times"
 def refined(
     x: Float[Array, "b f i j c"], noise: Float[Array, "b f h w c"], time: float
 ) -> Float[Array, "b f h w c"]:
-    """Return latents of the whole grid at a time, from those of the half grid and initial noise."""
+    """Return latents of the whole grid at a time, from the half grid's and the initial noise."""
     return (1 - time / 2) * repeated(x) + time * (noise - repeated(means(noise)))
 
 

@@ -67,7 +67,7 @@ class WanDiTConfig(WanDiTSizes):
     also_train: ClassVar[tuple[str, ...]] = ()
     """Patterns of the weights that are trained in full along with a LoRA."""
     half_grid: ClassVar[bool] = True
-    """Whether it is a `HalfGridDenoiser`."""
+    """Mark of a `HalfGridDenoiser`."""
 
     def build(self, *, rngs: nnx.Rngs) -> WanDiT:
         """Build the network with random weights."""

@@ -90,7 +90,7 @@ def test_data_that_the_half_grid_can_show_come_out_as_on_the_whole_grid(noise, s
 
 
 @pytest.mark.parametrize("solver", [UniPC(), DPMSolver()])
-def test_multistep_solvers_start_anew_on_the_whole_grid(noise, solver):
+def test_multistep_solvers_start_again_on_the_whole_grid(noise, solver):
     given = {"process": PROCESS, "solver": solver}
     exact = integrate(velocity_on_whole, noise, steps=400, **given)
     for_steps = [
@@ -115,7 +115,7 @@ def test_the_noise_of_the_half_grid_is_standard_and_shared():
     assert half.mean() == pytest.approx(0, abs=0.01)
     assert half.var() == pytest.approx(1, abs=0.01)
     assert (half[:, :, 1:] * half[:, :, :-1]).mean() == pytest.approx(0, abs=0.01)
-    # Its own noise gives back that of the whole grid, any other as much noise.
+    # Its own noise gives back the whole noise, any other as much noise.
     np.testing.assert_allclose(refined(jnp.asarray(half), whole, 1.0), whole, atol=1e-6)
     other = jax.random.normal(jax.random.key(2), half.shape)
     (time,) = half_times(np.array([0.6]))
@@ -154,7 +154,7 @@ def test_a_batch_gives_what_its_samples_give_alone(noise, cache):
         np.testing.assert_allclose(together[index], alone[0], rtol=1e-5, atol=1e-6)
 
 
-def test_a_cache_leaves_out_passes_on_both_grids(noise):
+def test_a_cache_skips_passes_on_both_grids(noise):
     runs = []
     sampled(noise, 0.5, cache=StepCache(threshold=0.2, first=2), runs=runs).block_until_ready()
     jax.effects_barrier()
