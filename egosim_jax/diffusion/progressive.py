@@ -17,7 +17,7 @@ become latents of the whole grid with the detail of the noise e that the clip st
     x_t = (1 - t / 2) repeat(x') + t (e - repeat(mean e))
 
 Both grids so share their noise, and the means of x_t are again the latents of the half grid. The
-noise of x_t has the variance t^2 (1/4 + 3/4). The solver starts again there, without a memory of the
+noise of x_t has the variance t^2 (1/4 + 3/4). The solver starts again there, with no memory of the
 half grid.
 """
 
