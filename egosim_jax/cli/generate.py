@@ -42,6 +42,7 @@ class Generate:
             "guidance_interval",
             "cache",
             "activations_8bit",
+            "progressive",
             "lora",
             "lora_scale",
             "baseline",
@@ -111,6 +112,10 @@ class Generate:
     Without it every step is exact (docs/performance.md, "Fewer forward passes")."""
     activations_8bit: bool = False
     """Compute the products of 8-bit weights with 8-bit activations (`egosim convert quantize`)."""
+    progressive: float | None = None
+    """Run this share of the steps, the first ones, on half the rows and columns of the latents.
+
+    For instance 0.6. Without it every step is exact."""
     seed: int = 0
     """Seed of the noise and, without --metadata, of the first scene."""
     batch_size: int | None = None
@@ -232,7 +237,7 @@ class Generate:
     def _model(self) -> ModelConfig:
         """Return the model config with the options applied."""
         from egosim_jax import configs
-        from egosim_jax.diffusion import SOLVERS, Guidance, RectifiedFlow, StepCache
+        from egosim_jax.diffusion import SOLVERS, Guidance, Progressive, RectifiedFlow, StepCache
         from egosim_jax.generation.batch import STRENGTH
         from egosim_jax.generation.distilled import distilled
 
@@ -269,6 +274,9 @@ class Generate:
             if not isinstance(config.process, RectifiedFlow):
                 raise InputError(f"{config.name} is not a rectified flow. (--solver wan)")
             config = replace(config, process=RectifiedFlow.wan_unipc(config.process.shift))
+        # Last: its check needs the final solver and process.
+        if self.progressive is not None:
+            config = replace(config, progressive=Progressive(share=self.progressive))
         return config
 
     @property

@@ -39,6 +39,14 @@ class Preflight:
     """Clips generated together; by default one per group of devices that share a clip."""
     steps: int | None = None
     """Denoising steps, instead of the model's."""
+    guidance: float | None = None
+    """Scale of the guidance on the text, instead of the model's; not 1: two passes a step."""
+    computed: float | None = None
+    """Share of the steps that run their passes while --cache reuses the others, such as 0.4.
+
+    The share depends on threshold and clip; `tests.benchmarks.bench_passes` counts it."""
+    progressive: float | None = None
+    """Run this share of the steps, the first ones, on half the rows and columns of the latents."""
     chunks: tuple[int, ...] = ()
     """Latent frames of each chunk, for a causal student of the model; by default the model's own.
 
@@ -70,7 +78,7 @@ class Preflight:
         compile_offline()
         share_with_jax()
         config, target = configs.get(self.config), find(self.target)
-        config = replace(config, steps=self.steps or config.steps)
+        config = self._sampling(replace(config, steps=self.steps or config.steps))
         if self.chunks:
             chunks = Chunks(sizes=self.chunks, first_steps=self.first_steps)
             config = replace(config, chunks=chunks)
@@ -84,7 +92,7 @@ class Preflight:
         size = self.batch_size or parts("batch", mesh)
         by_program = {}
         for name, report in compile_generation(
-            config, target, mesh, size, weights=self.weights_8bit
+            config, target, mesh, size, weights=self.weights_8bit, computed=self.computed or 1.0
         ):
             by_program[name] = report
             if not self.json:
@@ -98,6 +106,24 @@ class Preflight:
         fits = all(report.fits for report in by_program.values())
         return ExitCode.DONE if fits else ExitCode.FAILED
 
+    def _sampling(self, config: ModelConfig) -> ModelConfig:
+        """Return the config with the options that save or add forward passes."""
+        from egosim_jax.diffusion import Guidance, Progressive, StepCache
+
+        if self.guidance is not None:
+            config = replace(config, guidance=Guidance(scale=self.guidance))
+        if self.computed is not None:
+            if not 0 < self.computed <= 1:
+                raise InputError(
+                    f"{self.computed:g} is no share of computed steps: it must be above 0 and at "
+                    "most 1. (--computed)"
+                )
+            # Any threshold: memory and FLOPs depend on the share alone.
+            config = replace(config, cache=StepCache(threshold=0.05))
+        if self.progressive is not None:
+            config = replace(config, progressive=Progressive(share=self.progressive))
+        return config
+
 
 def compile_generation(
     config: ModelConfig,
@@ -106,10 +132,12 @@ def compile_generation(
     size: int,
     *,
     weights: Kind | None = None,
+    computed: float = 1.0,
 ) -> Iterator[tuple[str, Report | OutOfMemory]]:
     """Yield the report of each program of generation, with the weights of all networks resident.
 
-    `weights` is the kind of weights in 8 bits; None: all are in the compute dtype.
+    `weights` is the kind of weights in 8 bits; None: all are in the compute dtype. `computed` is
+    the share of the steps that a cache does not reuse.
     """
     from flax import nnx
 
@@ -134,7 +162,8 @@ def compile_generation(
     for name, program, given in generator.programs(size):
         if name == "noise":  # negligible: it only fills an array of the latents' size
             continue
-        yield name, compile_for(target, program.trace(*given), resident=resident)
+        traced = program.trace(*given)
+        yield name, compile_for(target, traced, resident=resident, taken=computed)
 
 
 def _stored(network: nnx.Module, dtype: str) -> nnx.Module:

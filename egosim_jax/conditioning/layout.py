@@ -13,7 +13,7 @@ cell is latent 0, not the latent of gray or black (EgoSim release).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import jax.numpy as jnp
@@ -21,8 +21,9 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 
 from egosim_jax.conditioning.condition import Condition
-from egosim_jax.conditioning.mask import Packing, pack_mask
+from egosim_jax.conditioning.mask import Packing, halve_mask, pack_mask
 from egosim_jax.data.static import check_observed
+from egosim_jax.diffusion.progressive import means
 from egosim_jax.types import InputError, VideoGrid
 
 Part = Literal["noisy", "mask", "prior", "hands"]
@@ -127,6 +128,25 @@ class ChannelLayout:
                 array = array * (1 - jnp.asarray(condition.mask, dtype)[..., :1])
             channels.append(array)
         return jnp.concatenate(channels, axis=-1) if channels else noisy[..., :0]
+
+    def halve(self, condition: Condition) -> Condition:
+        """Return a condition on half the rows and columns of its latent grid.
+
+        Latents become the means of 2 x 2 cells, a masked prior's of the observed cells among them.
+        """
+        mask, prior, hands = condition.mask, condition.prior, condition.hands
+        if prior is not None and mask is not None and self.mask_prior:
+            observed = 1 - jnp.asarray(mask, prior.dtype)[..., :1]
+            # A block without an observed cell has the sum 0; its quotient must be finite.
+            prior = means(prior * observed) / jnp.maximum(means(observed), 1 / 8)
+        elif prior is not None:
+            prior = means(prior)
+        return replace(
+            condition,
+            mask=None if mask is None else halve_mask(mask, self.mask_packing),
+            prior=prior,
+            hands=None if hands is None else means(hands),
+        )
 
     def mask_value(self, mask: Float[Array, "*b m"]) -> Float[Array, "*b m"]:
         """Return the denoiser's input for a mask of 1 = generate."""

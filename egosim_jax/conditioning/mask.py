@@ -24,7 +24,7 @@ from typing import Literal
 
 import numpy as np
 from einops import rearrange
-from jaxtyping import UInt8
+from jaxtyping import Array, Float, UInt8
 
 from egosim_jax.data.static import HALF_WHITE, check_observed
 from egosim_jax.types import WAN_GRID, InputError, VideoGrid
@@ -68,3 +68,13 @@ def pack_mask(
         generate = rearrange(generate, "f (h i) (w j) -> f h w (i j)", i=side, j=side)
     generate[0] = False
     return generate.astype(np.uint8)
+
+
+def halve_mask(mask: Float[Array, "*b h w m"], packing: Packing) -> Float[Array, "*b i j m"]:
+    """Return a packed mask on half the rows and columns: the mask of every second pixel.
+
+    The selection of the nearest pixel keeps it 0 or 1, as the denoiser knows it.
+    """
+    if packing == "space":
+        return rearrange(mask[..., 0], "... (h i) (w j) -> ... h w (i j)", i=2, j=2)
+    return mask[..., ::2, ::2, :]

@@ -20,6 +20,7 @@ from egosim_jax.conditioning.text import PromptTokenizer
 from egosim_jax.diffusion.caching import StepCache
 from egosim_jax.diffusion.guidance import Guidance
 from egosim_jax.diffusion.process import RectifiedFlow, VariancePreserving
+from egosim_jax.diffusion.progressive import Progressive
 from egosim_jax.diffusion.solver import Euler, Solver
 from egosim_jax.io import weights
 from egosim_jax.io.bounded import quote_path
@@ -115,6 +116,8 @@ class ModelConfig:
     """Number of denoising steps, or the timesteps to visit."""
     cache: StepCache | None = None
     """Reuse of predictions at steps where they would hardly change; None: every step is exact."""
+    progressive: Progressive | None = None
+    """First steps on half the latent grid; None: every step is on the whole grid."""
     chunks: Chunks | None = None
     """Chunks that the denoiser makes one after the other, a causal student; None: all at once."""
     activations: Literal["8bit"] | None = None
@@ -163,6 +166,19 @@ class ModelConfig:
             )
         if self.chunks is not None:
             self._check_causal(self.chunks)
+        if self.progressive is not None:
+            self._check_progressive(self.progressive)
+
+    def _check_progressive(self, progressive: Progressive) -> None:
+        """Raise `InputError` unless the denoiser and the sampler allow steps on half the grid."""
+        if not getattr(self.dit, "half_grid", False):
+            raise InputError(
+                f"{self.name}: the denoiser of {type(self.dit).__name__} does not run on half its "
+                "grid. Omit the steps there. (--progressive)"
+            )
+        steps = len(self.process.times(self.visited)) - 1
+        _, *cells = self.latent_shape
+        progressive.check(self.process, self.solver, steps, cells, self.dit.patch[1])
 
     def _check_causal(self, chunks: Chunks) -> None:
         """Raise `InputError` for what a causal student cannot do."""
@@ -178,6 +194,7 @@ class ModelConfig:
             ("strength", self.strength, None),
             ("encoding_noise", self.encoding_noise, None),
             ("cache", self.cache, None),
+            ("progressive", self.progressive, None),
         ):
             if value != usual:
                 raise InputError(

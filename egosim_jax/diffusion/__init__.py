@@ -7,6 +7,7 @@ Pure functions of arrays and a predicting function belong here. Networks do not.
     SOLVERS                                 solvers by name, also of other packages
     integrate                               the sampling loop, one scan
     StepCache                               steps that reuse predictions
+    Progressive                             early steps on half the latent grid
     Guidance                                classifier-free guidance
     Objective                               training loss at random noise levels
 """
@@ -22,6 +23,7 @@ from egosim_jax.diffusion.process import (
     RectifiedFlow,
     VariancePreserving,
 )
+from egosim_jax.diffusion.progressive import Progressive
 from egosim_jax.diffusion.solver import DDIM, SOLVERS, Euler, Renoise, Solver, integrate
 from egosim_jax.diffusion.unipc import UniPC
 
@@ -35,6 +37,7 @@ __all__ = [
     "Objective",
     "Prediction",
     "Process",
+    "Progressive",
     "RectifiedFlow",
     "Renoise",
     "Solver",

@@ -28,16 +28,14 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from jax.sharding import Mesh
-from jaxtyping import Array, Float, Key, UInt8
+from jaxtyping import Array, Float, UInt8
 
-from egosim_jax.conditioning.condition import Condition
 from egosim_jax.conditioning.condition import Name as ConditionName
 from egosim_jax.conditioning.pixels import to_model, to_uint8
 from egosim_jax.configs.model import ModelConfig, Networks
-from egosim_jax.diffusion.process import DenoiseFn
-from egosim_jax.diffusion.solver import integrate
-from egosim_jax.generation.causal import ChunkDenoiser, denoise_chunks
+from egosim_jax.generation.causal import ChunkDenoiser
 from egosim_jax.generation.compiled import CompiledFn
+from egosim_jax.generation.denoising import denoise
 from egosim_jax.generation.encoding import (
     SOLVER_NOISE,
     batch_shapes,
@@ -58,7 +56,7 @@ from egosim_jax.generation.stream import (
 )
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.run import plain
-from egosim_jax.models import CausalDenoiser, Denoiser, eight_bit
+from egosim_jax.models import CausalDenoiser, eight_bit
 from egosim_jax.rendering import PriorKind, Renderer, jitted
 from egosim_jax.runtime.phases import phase
 from egosim_jax.sharding import fetch, shard_params
@@ -73,46 +71,6 @@ from egosim_jax.types import (
 )
 
 T = TypeVar("T")
-
-
-def denoise(
-    dit: Denoiser,
-    condition: Condition,
-    noise: Float[Array, "b f h w z"],
-    config: ModelConfig,
-    keys: Key[Array, " b"] | None = None,
-) -> Float[Array, "b f h w z"]:
-    """Run the sampler; the unconditional branch uses the negative-prompt embeddings.
-
-    `keys`, one for each item, draw the noise that a stochastic solver adds.
-    """
-    if config.chunks is not None:
-        return denoise_chunks(cast(CausalDenoiser, dit), condition, noise, config, keys)
-    if config.strength is not None and condition.prior is not None:
-        # SDEdit: the prior, noised to the first level, is the start instead of a condition.
-        start = jnp.asarray(config.process.times(config.visited)[0], jnp.float32)
-        noise = config.process.add_noise(condition.prior, noise, start)
-        condition = condition.drop("prior")
-    channels = config.layout.condition_channels(condition, noise)
-
-    def branch(text: Array) -> DenoiseFn:
-        context = dit.prepare(channels, text, condition.image)
-        return lambda x, t: dit.denoise(x, t, context)
-
-    text = jnp.asarray(condition.text)
-    conditional = branch(text)
-    # At scale 1 guidance returns the conditional branch: do not compute the other one.
-    guided = config.guidance.scale != 1
-    unconditional = branch(condition.drop("text").text) if guided else conditional
-    return integrate(
-        config.guidance.guide(conditional, unconditional),
-        noise,
-        process=config.process,
-        solver=config.solver,
-        steps=config.visited,
-        keys=keys,
-        cache=config.cache,
-    )
 
 
 class Generator:

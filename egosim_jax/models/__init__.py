@@ -50,6 +50,23 @@ class Denoiser(Protocol):
 
 
 @runtime_checkable
+class HalfGridDenoiser(Denoiser, Protocol):
+    """Denoiser that can also run on half the rows and columns of its latent grid.
+
+    Its config has a true `half_grid`.
+    """
+
+    def prepare_half(
+        self,
+        condition: Float[Array, "b f h w c"],
+        text: Float[Array, "b n d"],
+        image: Float[Array, "b m e"] | None = None,
+    ) -> Any:
+        """Compute the context of steps on the half grid, as `prepare` does."""
+        ...
+
+
+@runtime_checkable
 class CausalDenoiser(Denoiser, Protocol):
     """Denoiser that can also make a clip chunk by chunk, from the chunks before."""
 

@@ -23,9 +23,15 @@ def pairs(head_dim: int) -> tuple[int, int, int]:
     return head_dim // 2 - 2 * side, side, side
 
 
-def rotations(frames: int, rows: int, columns: int, head_dim: int) -> Float[Array, "n k 2"]:
-    """Return the rotations of tokens at whole positions, in the order (frame, row, column)."""
+def rotations(
+    frames: int, rows: int, columns: int, head_dim: int, *, side: int = 1
+) -> Float[Array, "n k 2"]:
+    """Return the rotations of tokens at whole positions, in the order (frame, row, column).
+
+    Tokens with a larger `side`, in rows and columns, are at the middle of the tokens they replace.
+    """
     f, r, c = (np.arange(size, dtype=float) for size in (frames, rows, columns))
+    r, c = (side * p + (side - 1) / 2 for p in (r, c))
     return rotations_at((f, r, c), pairs(head_dim))
 
 

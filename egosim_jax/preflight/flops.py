@@ -2,7 +2,8 @@
 
 Counts matrix products and convolutions, with two FLOPs for a multiplication and an addition. Flash
 attention kernels, which a jaxpr only names, count by the products inside. Rematerialization in a
-backward pass counts; equations with unused results do not.
+backward pass counts; equations with unused results do not. Of the branches of a condition, the
+costliest counts, or a share of it where it runs at some of the steps only (`StepCache`).
 """
 
 from __future__ import annotations
@@ -23,9 +24,14 @@ SPLASH = {"splash_mha_fwd": 2, "splash_mha_dkv": 5}
 """Products in the splash kernels, by the beginning of the name; the backward pass is fused."""
 
 
-def count(jaxpr: Any) -> float:
-    """Return the FLOPs of a traced program (`jax.make_jaxpr`, `jax.jit(...).trace`)."""
-    return sum((_of(equation) for equation in _used(getattr(jaxpr, "jaxpr", jaxpr))), 0.0)
+def count(jaxpr: Any, *, taken: float = 1.0) -> float:
+    """Return the FLOPs of a traced program (`jax.make_jaxpr`, `jax.jit(...).trace`).
+
+    `taken` is the share of the runs of a condition that take its costliest branch; the others take
+    the cheapest one.
+    """
+    equations = _used(getattr(jaxpr, "jaxpr", jaxpr))
+    return sum((_of(equation, taken) for equation in equations), 0.0)
 
 
 def _used(jaxpr: Any) -> Iterator[Any]:
@@ -40,7 +46,7 @@ def _used(jaxpr: Any) -> Iterator[Any]:
             yield equation
 
 
-def _of(equation: Any) -> float:
+def _of(equation: Any, taken: float) -> float:
     name, params = equation.primitive.name, equation.params
     if name == "dot_general":
         ((contracted, _), _) = params["dimension_numbers"]
@@ -55,11 +61,12 @@ def _of(equation: Any) -> float:
     if name == "pallas_call":
         return _splash(equation)
     if name == "scan":
-        return params["length"] * count(params["jaxpr"])
+        return params["length"] * count(params["jaxpr"], taken=taken)
     if name == "cond":
-        return max(count(branch) for branch in params["branches"])
+        costs = [count(branch, taken=taken) for branch in params["branches"]]
+        return taken * max(costs) + (1 - taken) * min(costs)
     copies = params["mesh"].size if name == "shard_map" else 1
-    return copies * sum((count(inner) for inner in _inner(params)), 0.0)
+    return copies * sum((count(inner, taken=taken) for inner in _inner(params)), 0.0)
 
 
 def _inner(params: dict[str, Any]) -> list[Any]:

@@ -82,11 +82,17 @@ class OutOfMemory:
 
 
 def compile_for(
-    target: Target, traced: Any, *, model_flops: float = math.nan, resident: int = 0
+    target: Target,
+    traced: Any,
+    *,
+    model_flops: float = math.nan,
+    resident: int = 0,
+    taken: float = 1.0,
 ) -> Report | OutOfMemory:
     """Compile a trace of `jax.jit` for the target's devices, and report its costs.
 
-    `resident` is the size in bytes of other data on the device, such as all networks' weights.
+    `resident` is the size in bytes of other data on the device, such as all networks' weights, and
+    `taken` the share of the steps at which a condition runs its costliest branch (`flops.count`).
     """
     begun = time.perf_counter()
     try:
@@ -99,7 +105,7 @@ def compile_for(
     temporaries = stats.temp_size_in_bytes
     if device.platform == "tpu":  # its temporaries include donated arguments
         temporaries = stats.peak_memory_in_bytes - stats.argument_size_in_bytes - results
-    hardware_flops = flops.count(traced.jaxpr)
+    hardware_flops = flops.count(traced.jaxpr, taken=taken)
     return Report(
         target=target.name,
         devices=count,

@@ -35,7 +35,7 @@ def main() -> None:
     triplets, metric = held_out(full, options.clips), lpips.Lpips.load("alex")
     print("| weights | activations | MB | latents | PSNR | LPIPS |")
     print("| --- | --- | --- | --- | --- | --- |")
-    _, *whole = sampled(full, triplets, shipped)
+    _, _, *whole = sampled(full, triplets, shipped)
     print(f"| float16 | float32 | {_megabytes(shipped)} | | | |", flush=True)
     with tempfile.TemporaryDirectory() as temporary:
         for kind in DTYPES:
@@ -43,7 +43,7 @@ def main() -> None:
             if convert(["quantize", str(shipped), "--out", str(folder), "--kind", kind]):
                 raise SystemExit(1)
             for name, config in {"float32": full, kind: with_activations}.items():
-                _, *sample = sampled(config, triplets, folder)
+                _, _, *sample = sampled(config, triplets, folder)
                 shown = distances(metric, tuple(sample), tuple(whole))
                 print(f"| {kind} | {name} | {_megabytes(folder)} | {shown}", flush=True)
 

@@ -1,11 +1,13 @@
 """Forward passes of sampling and what leaving some out costs, on the shipped model.
 
-    python -m tests.benchmarks.bench_passes [--clips 3] [--steps 50] [--scale 2]
+    python -m tests.benchmarks.bench_passes [--clips 3] [--steps 50] [--scale 2] [--only TEXT]
 
 samples clips of held-out scenes with guidance, with all steps and both passes of each. Then it
-reuses predictions below several thresholds, guides in an interval only, and takes fewer steps, and
-prints the forward passes of a clip and the distance to the first sampling: of the latents
-(relative L2) and of the frames (PSNR and LPIPS).
+reuses predictions below several thresholds, guides in an interval only, takes the first steps on
+half the grid, and takes fewer steps. It prints the forward passes of a clip, how many of them were
+on half the grid, and the distance to the first sampling: of the latents (relative L2) and of the
+frames (PSNR and LPIPS). `--only TEXT` samples only the variants whose name has the text, and the
+first one.
 """
 
 from __future__ import annotations
@@ -21,9 +23,9 @@ import numpy as np
 import egosim_jax as egosim
 from egosim_jax import configs
 from egosim_jax.configs.model import ModelConfig
-from egosim_jax.diffusion import Guidance, StepCache
+from egosim_jax.diffusion import Guidance, Progressive, StepCache
 from egosim_jax.evaluation.metrics import lpips
-from egosim_jax.generation import generator
+from egosim_jax.generation.denoising import denoise
 from egosim_jax.generation.encoding import pack
 from egosim_jax.types import Triplet
 from egosim_jax.worlds.tabletop import make_sequence
@@ -33,6 +35,7 @@ from egosim_jax.worlds.tabletop.dataset import conditions_of
 NAME, FIRST_SEED = "tabletop", 700
 THRESHOLDS = (0.02, 0.05, 0.1, 0.2)
 INTERVAL = (200.0, 900.0)
+SHARES = (0.1, 0.2, 0.3, 0.5, 0.66)
 Sample = tuple[np.ndarray, np.ndarray]
 """Latents and frames of clips."""
 
@@ -46,6 +49,12 @@ def variants(full: ModelConfig, steps: int, scale: float) -> Iterator[tuple[str,
     yield "`--guidance-interval {:g} {:g}`".format(*INTERVAL), limited
     both = replace(limited, cache=StepCache(threshold=THRESHOLDS[1]))
     yield f"both, `--cache {THRESHOLDS[1]:g}`", both
+    for share in SHARES:
+        progressive = replace(full, progressive=Progressive(share=share))
+        yield f"`--progressive {share:g}`", progressive
+        if share in SHARES[1:3]:
+            both = replace(progressive, cache=StepCache(threshold=THRESHOLDS[1]))
+            yield f"`--progressive {share:g}`, `--cache {THRESHOLDS[1]:g}`", both
     for count in (steps // 2, steps // 4):
         yield f"`--steps {count}`", replace(full, steps=count)
 
@@ -56,18 +65,22 @@ def main() -> None:
     parser.add_argument("--clips", type=int, default=3)
     parser.add_argument("--steps", type=int, default=50)
     parser.add_argument("--scale", type=float, default=2.0)
+    parser.add_argument("--only", default="")
     options = parser.parse_args()
     model = configs.get(NAME)
     full = replace(model, steps=options.steps, guidance=Guidance(scale=options.scale))
     triplets = held_out(model, options.clips)
     metric = lpips.Lpips.load("alex")
-    print("| sampling | passes | latents | PSNR | LPIPS |\n| --- | --- | --- | --- | --- |")
+    print("| sampling | passes | on half the grid | latents | PSNR | LPIPS |")
+    print("| --- | --- | --- | --- | --- | --- |")
     whole = None
     for name, config in variants(full, options.steps, options.scale):
-        passes, latents, frames = sampled(config, triplets)
+        if whole is not None and options.only not in name:
+            continue
+        passes, halves, latents, frames = sampled(config, triplets)
         whole = whole or (latents, frames)
         shown = distances(metric, (latents, frames), whole)
-        print(f"| {name} | {passes:.1f} | {shown}", flush=True)
+        print(f"| {name} | {passes:.1f} | {halves:.1f} | {shown}", flush=True)
 
 
 def held_out(model: ModelConfig, clips: int) -> list[Triplet]:
@@ -96,26 +109,23 @@ def distances(metric: lpips.Lpips, sample: Sample, whole: Sample) -> str:
 
 def sampled(
     config: ModelConfig, triplets: list[Triplet], weights: Path | None = None
-) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the mean number of forward passes of a clip, the latents and the frames."""
+) -> tuple[float, float, np.ndarray, np.ndarray]:
+    """Return the forward passes of a clip, those on half the grid, the latents and the frames."""
     sampler = egosim.Generator.load(config, weights or configs.shipped_weights(NAME))
-    network, passes = sampler.networks.dit, 0
+    network, rows = sampler.networks.dit, []
 
     class Counted:
         """The denoiser, whose forward passes are counted."""
 
         prepare = staticmethod(network.prepare)
+        prepare_half = staticmethod(network.prepare_half)
 
         @staticmethod
         def denoise(x: jax.Array, t: jax.Array, context: object) -> jax.Array:
-            def count(_: object) -> None:
-                nonlocal passes
-                passes += 1
-
-            jax.debug.callback(count, t[0])
+            jax.debug.callback(lambda _: rows.append(x.shape[2]), t[0])
             return network.denoise(x, t, context)
 
-    sample = jax.jit(lambda c, n: generator.denoise(Counted, c, n, config))
+    sample = jax.jit(lambda c, n: denoise(Counted, c, n, config))
     latents = []
     for seed, triplet in enumerate(triplets):  # one after the other: each has its own passes
         seeds = np.array([seed], np.uint32)
@@ -123,7 +133,9 @@ def sampled(
         latents.append(sample(condition, sampler.noise(seeds)))
     jax.effects_barrier()
     together = np.concatenate([np.asarray(latent) for latent in latents])
-    return passes / len(triplets), together, np.asarray(sampler.decode(together))
+    halves = sum(count < together.shape[2] for count in rows)
+    frames = np.asarray(sampler.decode(together))
+    return len(rows) / len(triplets), halves / len(triplets), together, frames
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from flax import nnx
 from egosim_jax import configs
 from egosim_jax.configs.model import Networks
 from egosim_jax.diffusion.process import RectifiedFlow
-from egosim_jax.generation.generator import denoise
+from egosim_jax.generation.denoising import denoise
 from egosim_jax.train.online.pool import latent_shapes
 from egosim_jax.train.tasks.denoising import Denoising, condition_of
 from egosim_jax.train.tasks.few_steps import FewSteps

@@ -171,6 +171,28 @@ def test_generation_is_compiled_program_by_program(capsys):
         assert program["hardware_flops"] > 0
 
 
+def test_options_that_save_passes_save_flops(capsys):
+    """Guided: two passes a step, of 4 steps; half the grid has a quarter of the tokens."""
+    flops = {}
+    for options in ("", "--computed 0.5", "--progressive 0.5"):
+        command = "preflight --config debug --target cpu:1 --json --guidance 2"
+        assert egosim([*command.split(), *options.split()]) == 0
+        flops[options] = json.loads(capsys.readouterr().out)["denoise"]["hardware_flops"]
+    plain = flops[""]
+    assert plain / 2 < flops["--computed 0.5"] < 0.6 * plain
+    assert plain / 2 < flops["--progressive 0.5"] < 0.75 * plain
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [("--computed 1.5", "no share of computed steps"), ("--progressive 1", "--progressive")],
+)
+def test_shares_of_steps_out_of_range_are_refused(options, message, capsys):
+    command = f"preflight --config debug --target cpu:1 {options}"
+    assert egosim(command.split()) == 2
+    assert message in capsys.readouterr().err
+
+
 @pytest.mark.usefixtures("small")
 def test_a_generation_that_does_not_fit_ends_with_1(capsys):
     assert egosim(["preflight", "--config", "debug", "--target", "cpu:1"]) == 1

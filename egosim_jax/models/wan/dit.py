@@ -66,6 +66,8 @@ class WanDiTConfig(WanDiTSizes):
     """Patterns of the linear layers that a LoRA adapts."""
     also_train: ClassVar[tuple[str, ...]] = ()
     """Patterns of the weights that are trained in full along with a LoRA."""
+    half_grid: ClassVar[bool] = True
+    """Mark of a `HalfGridDenoiser`."""
 
     def build(self, *, rngs: nnx.Rngs) -> WanDiT:
         """Build the network with random weights."""
@@ -192,6 +194,21 @@ class WanDiT(nnx.Module):
         """
         self.patch.check(condition.shape)
         return self.prepare_chunk(condition, self.share(text, image), 0)
+
+    def prepare_half(
+        self,
+        condition: Float[Array, "b f h w c"],
+        text: Float[Array, "b n e"],
+        image: Float[Array, "b m i"] | None = None,
+    ) -> DiTContext:
+        """Compute the context of steps on half the rows and columns, by the condition there.
+
+        Its tokens have the positions of the 2 x 2 tokens of the whole grid that they replace.
+        """
+        context = self.prepare(condition, text, image)
+        _, f, h, w, _ = condition.shape
+        rotation = rope.rotations(f, h // PATCH, w // PATCH, self.config.head_dim, side=2)
+        return replace(context, rotation=rotation)
 
     def share(
         self, text: Float[Array, "b n e"], image: Float[Array, "b m i"] | None = None

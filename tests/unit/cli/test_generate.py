@@ -10,7 +10,7 @@ from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
 from egosim_jax.cli.generate import Generate
 from egosim_jax.data.clips import write_clips
-from egosim_jax.diffusion import Guidance, Renoise
+from egosim_jax.diffusion import Guidance, Progressive, Renoise
 from egosim_jax.generation.batch import BatchJob
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.types import InputError, VideoSpec
@@ -126,3 +126,27 @@ def test_a_step_distilled_lora_brings_its_sampler(name, recognized, tmp_path, ca
     assert got == (sampler if recognized else usual)
     assert ("is distilled: 4 steps" in capsys.readouterr().err) == recognized
     assert replace(command, steps=8)._model().steps == 8
+
+
+def test_a_share_of_the_steps_is_asked_for_on_half_the_grid(tmp_path):
+    (tmp_path / "dit.safetensors").touch()
+    plain = configs.get("egosim_14b").at(tmp_path)
+    command = Generate(config="egosim_14b", weights=tmp_path, progressive=0.66)
+    assert command._model() == replace(plain, progressive=Progressive(share=0.66))
+    assert replace(command, progressive=None)._model() == plain
+
+
+@pytest.mark.parametrize(
+    ("config", "options", "message"),
+    [
+        ("egosim_14b_student", {}, "chunk by chunk, which supports only progressive None"),
+        ("dwm_cogvideox_5b", {}, "CogVideoXDiTConfig does not run on half its grid"),
+        ("egosim_14b", {"solver": "renoise"}, "Renoise adds noise"),
+        ("egosim_14b", {"steps": 1}, "each of the two grids needs at least one step"),
+    ],
+)
+def test_models_without_steps_on_half_the_grid_refuse_them(config, options, message, tmp_path):
+    (tmp_path / "dit.safetensors").touch()
+    command = Generate(config=config, weights=tmp_path, progressive=0.5, **options)
+    with pytest.raises(InputError, match=message):
+        command._model()

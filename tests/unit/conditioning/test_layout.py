@@ -125,3 +125,31 @@ def test_a_condition_that_lacks_a_part_is_refused(condition):
 def test_a_layout_that_cannot_be_is_refused(changes, message):
     with pytest.raises(InputError, match=message):
         ChannelLayout(**changes)
+
+
+def test_half_a_condition_has_the_means_of_its_latents_of_the_prior_where_it_is_observed():
+    rng = np.random.default_rng(1)
+    prior, hands = rng.standard_normal((2, 2, 3, 4, 8, 16)).astype(np.float32)
+    mask = rng.integers(0, 2, (2, 3, 4, 8, 4)).astype(np.float32)
+    mask[0, 0, :2, :2] = 1  # a block without an observed cell
+    text = jnp.ones((2, 5, 8))
+    condition = Condition(
+        mask=jnp.asarray(mask), prior=jnp.asarray(prior), hands=jnp.asarray(hands), text=text
+    )
+    half, plain = EGOSIM.halve(condition), DWM_WAN.halve(condition)
+    assert half.text is text
+    assert half.mask is not None
+    for cell in np.ndindex(2, 3, 2, 4):
+        b, f, i, j = cell
+        block = [(b, f, 2 * i + di, 2 * j + dj) for di in (0, 1) for dj in (0, 1)]
+        observed = [prior[place] for place in block if mask[place][0] == 0]
+        wanted = np.mean(observed, axis=0) if observed else np.zeros(16)
+        np.testing.assert_allclose(half.prior[cell], wanted, atol=1e-6)
+        np.testing.assert_array_equal(half.mask[cell], [mask[place][0] for place in block])
+        every = np.mean([hands[place] for place in block], axis=0)
+        np.testing.assert_allclose(half.hands[cell], every, atol=1e-6)
+        every = np.mean([prior[place] for place in block], axis=0)
+        np.testing.assert_allclose(plain.prior[cell], every, atol=1e-6)
+        unmasked = 1 - mask[b, f, 2 * i, 2 * j, 0]
+        channels = EGOSIM.condition_channels(half, half.hands)[cell]
+        np.testing.assert_allclose(channels[4:20], unmasked * wanted, atol=1e-6)

@@ -1,9 +1,11 @@
 """Each rule of the mask against plain loops."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from egosim_jax.conditioning import pack_mask
+from egosim_jax.conditioning.mask import halve_mask
 from egosim_jax.types import InputError, VideoGrid
 
 
@@ -70,3 +72,12 @@ def test_a_constant_mask_is_zero_and_refuses_holes(frames):
 def test_a_video_without_whole_latent_cells_is_refused(shape, message):
     with pytest.raises(InputError, match=message):
         pack_mask(np.zeros(shape, np.uint8))
+
+
+@pytest.mark.parametrize(("packing", "channels"), [("space", 4), ("time", 4), ("single", 1)])
+def test_half_a_mask_is_the_packed_mask_of_every_second_pixel(frames, packing, channels):
+    whole = pack_mask(frames, packing=packing, channels=channels)
+    half = pack_mask(frames[:, ::2, ::2], packing=packing, channels=channels)
+    assert half.any()
+    halved = halve_mask(jnp.asarray(whole, jnp.float32), packing)
+    np.testing.assert_array_equal(halved, half)

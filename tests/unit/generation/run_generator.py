@@ -10,7 +10,7 @@ import numpy as np
 from egosim_jax import configs
 from egosim_jax.configs.model import Networks
 from egosim_jax.convert.__main__ import main as convert
-from egosim_jax.diffusion import StepCache
+from egosim_jax.diffusion import Progressive, StepCache
 from egosim_jax.generation.generator import Generator
 from egosim_jax.models.wan.dit import WanDiTConfig
 from egosim_jax.sharding import make_mesh
@@ -28,6 +28,13 @@ CONFIG = dataclasses.replace(
 )
 REUSING = dataclasses.replace(CONFIG, steps=8, cache=StepCache(threshold=0.3, first=2))
 """The same model, which reuses predictions."""
+PROGRESSIVE = dataclasses.replace(
+    CONFIG,
+    video=VideoSpec(frames=5, height=64, width=128),
+    steps=4,
+    progressive=Progressive(share=0.5),
+)
+"""The same networks on twice the rows and columns, with steps on half of them."""
 BATCH = 8
 MESHES = {(4, 2, 1): BATCH, (1, 1, 8): 1}
 """Data, fsdp, context; and how many clips: as many as there is room for, and one on all devices."""
@@ -42,6 +49,7 @@ def main(folder: Path) -> None:
     if convert(["quantize", str(folder / "full"), "--out", str(folder / "int8"), "--kind", "int8"]):
         raise SystemExit(1)
     triplets = [random_triplet(CONFIG.video, seed) for seed in range(BATCH)]
+    larger = [random_triplet(PROGRESSIVE.video, seed) for seed in range(BATCH)]
     found = {}
     for sizes, count in {None: BATCH, **MESHES}.items():
         mesh = sizes and make_mesh(
@@ -61,6 +69,9 @@ def main(folder: Path) -> None:
         for name, weight in {"kernel": layer.kernel, "scale": layer.scale}.items():
             (shape,) = {shard.data.shape for shard in weight.get_value().addressable_shards}
             found[f"{sizes} shard of {name}"] = np.array(shape)
+        progressive = Generator(PROGRESSIVE, generator.networks, mesh)
+        latents = progressive.latents(larger[:count], range(count))
+        found[f"{sizes} progressive"] = np.asarray(latents)
         found[f"{sizes} frames"] = np.stack([clip.frames for clip in clips])
     generator = Generator(CONFIG, networks, make_mesh(MeshConfig(data=4, fsdp=2)))
     try:

@@ -14,7 +14,7 @@ from egosim_jax.conditioning.condition import Condition
 from egosim_jax.configs.model import Networks
 from egosim_jax.diffusion.guidance import Guidance
 from egosim_jax.generation.causal import ChunkDenoiser
-from egosim_jax.generation.generator import denoise
+from egosim_jax.generation.denoising import denoise
 from egosim_jax.models.chunks import Chunks
 from egosim_jax.models.wan.dit import WanDiTConfig
 from egosim_jax.types import InputError, VideoSpec

@@ -13,10 +13,20 @@ from flax import nnx
 from egosim_jax import configs
 from egosim_jax.conditioning.condition import Condition
 from egosim_jax.configs.model import Networks
-from egosim_jax.diffusion import DDIM, DPMSolver, Guidance, VariancePreserving
+from egosim_jax.diffusion import (
+    DDIM,
+    DPMSolver,
+    Guidance,
+    Progressive,
+    StepCache,
+    VariancePreserving,
+    integrate,
+)
 from egosim_jax.generation.compiled import CompiledFn
+from egosim_jax.generation.denoising import denoise
 from egosim_jax.generation.encoding import encode_condition, pack
-from egosim_jax.generation.generator import Generator, NonFiniteError, denoise
+from egosim_jax.generation.generator import Generator, NonFiniteError
+from egosim_jax.models.chunks import Chunks
 from egosim_jax.types import InputError, Triplet, VideoSpec
 from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 
@@ -56,6 +66,81 @@ def test_a_batch_equals_batches_of_one(generator, triplets):
     )
     error = np.linalg.norm(together - alone) / np.linalg.norm(alone)
     assert error <= 1e-5
+
+
+# 8 x 8 latent cells, which the half grid divides.
+SQUARE = dataclasses.replace(CONFIG, video=VideoSpec(frames=5, height=64, width=64), steps=4)
+PROGRESSIVE = dataclasses.replace(SQUARE, progressive=Progressive(share=0.5))
+
+
+@pytest.fixture(scope="module")
+def squares() -> list[Triplet]:
+    return [to_triplet(next(make_sequence(seed, spec=SQUARE.video))) for seed in range(3)]
+
+
+def test_without_steps_on_half_the_grid_every_bit_is_the_plain_samplers(networks, squares):
+    """The plain sampler, written out here."""
+    guidance = Guidance(scale=2.0)
+    config = dataclasses.replace(SQUARE, guidance=guidance)
+    assert config.progressive is None
+    generator = Generator(config, networks)
+    condition, noise = generator.encode(pack(squares[:1], config)), generator.noise([3])
+
+    def plain(dit, condition, noise):
+        channels = config.layout.condition_channels(condition, noise)
+        with_text, without = (
+            dit.prepare(channels, text, condition.image)
+            for text in (condition.text, condition.drop("text").text)
+        )
+        guided = guidance.guide(
+            lambda x, t: dit.denoise(x, t, with_text), lambda x, t: dit.denoise(x, t, without)
+        )
+        return integrate(guided, noise, process=config.process, solver=config.solver, steps=4)
+
+    expected = np.asarray(CompiledFn(plain, networks.dit)(condition, noise))
+    np.testing.assert_array_equal(generator.latents(squares[:1], [3]), expected)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"guidance": Guidance(scale=2.0), "cache": StepCache(threshold=0.3, first=2)}],
+    ids=["plain", "guided, with a cache"],
+)
+def test_three_clips_with_steps_on_half_the_grid_equal_three_alone(networks, squares, options):
+    generator = Generator(dataclasses.replace(PROGRESSIVE, **options), networks)
+    together = np.asarray(generator.latents(squares, [3, 1, 2]))
+    alone = np.concatenate(
+        [generator.latents([clip], [seed]) for clip, seed in zip(squares, [3, 1, 2], strict=True)]
+    )
+    assert np.linalg.norm(together - alone) / np.linalg.norm(alone) <= 1e-5
+    whole = np.asarray(Generator(SQUARE, networks).latents(squares, [3, 1, 2]))
+    assert np.linalg.norm(together - whole) / np.linalg.norm(whole) > 1e-3  # they ran
+
+
+def test_sdedit_starts_on_half_the_grid_from_the_noised_prior(networks, squares):
+    """Almost without noise, it returns the prior."""
+    config = dataclasses.replace(
+        PROGRESSIVE, steps=(1.0, 0.5), strength=1.0, progressive=Progressive(share=0.5)
+    )
+    generator = Generator(config, networks)
+    latents = np.asarray(generator.latents(squares[:1], [3]))
+    prior = np.asarray(generator.encode(pack(squares[:1], config)).prior)
+    means = prior.reshape(*prior.shape[:2], 4, 2, 4, 2, -1).mean((3, 5))
+    np.testing.assert_allclose(latents, means.repeat(2, axis=2).repeat(2, axis=3), atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"video": CONFIG.video}, "4 x 6 cells have no half grid"),
+        ({"solver": DPMSolver(stochastic=True)}, "DPMSolver adds noise"),
+        ({"process": VariancePreserving(), "solver": DDIM()}, "rectified flow"),
+        ({"chunks": Chunks(sizes=(1, 1))}, "chunk by chunk, which supports only progressive None"),
+    ],
+)
+def test_models_without_steps_on_half_the_grid_are_refused(changes, message):
+    with pytest.raises(InputError, match=message):
+        dataclasses.replace(PROGRESSIVE, **changes)
 
 
 @pytest.mark.parametrize("hidden", ["prior", "mask", "hands", "text"])

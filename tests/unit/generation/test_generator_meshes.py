@@ -30,7 +30,7 @@ def test_clips_of_a_mesh_are_those_of_one_device(found):
     """In float32: sums are taken in another order."""
     for mesh in ("(4, 2, 1)", "(1, 1, 8)"):
         frames = found[f"{mesh} frames"].astype(int)
-        for name in ("latents", "reused", "int8"):
+        for name in ("latents", "reused", "int8", "progressive"):
             latents = found[f"{mesh} {name}"]
             alone = found[f"None {name}"][: len(latents)]
             assert np.linalg.norm(latents - alone) / np.linalg.norm(alone) <= 1e-5

@@ -33,3 +33,12 @@ def test_tables_are_exact_to_float32_at_far_positions():
     angle = 999 * 10000.0 ** (-1 / 2)
     c, s = np.cos(angle), np.sin(angle)
     np.testing.assert_allclose(rotation[999, 2:4], [[c, -s], [c, s]], atol=6e-8)
+
+
+def test_larger_tokens_are_at_the_middle_of_the_tokens_that_they_replace():
+    # A head of 12 has two pairs of each axis, whose first turns by the position itself.
+    cosines = np.asarray(rope.rotations(2, 2, 3, 12, side=2)).reshape(2, 2, 3, 6, 2, 2)[..., 0, 0]
+    frames, rows, columns = (cosines[..., pair] for pair in (0, 2, 4))
+    np.testing.assert_allclose(frames[:, 0, 0], np.cos([0, 1]), atol=ROUNDING)
+    np.testing.assert_allclose(rows[0, :, 0], np.cos([0.5, 2.5]), atol=ROUNDING)
+    np.testing.assert_allclose(columns[0, 0], np.cos([0.5, 2.5, 4.5]), atol=ROUNDING)

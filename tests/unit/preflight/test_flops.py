@@ -63,6 +63,18 @@ def test_loops_count_each_iteration_and_branches_the_longer_one():
     assert counted(either, w, w) == 2 * 8**3
 
 
+def test_a_share_of_a_conditions_runs_takes_the_costliest_branch():
+    w = shape(8, 8)
+
+    def loop(x, w):
+        step = lambda x, _: (jax.lax.cond(x[0, 0] > 0, lambda: x @ w @ w, lambda: x @ w), None)  # noqa: E731
+        return jax.lax.scan(step, x, length=10)[0]
+
+    product, jaxpr = 2 * 8**3, jax.make_jaxpr(loop)(w, w)
+    assert count(jaxpr) == 10 * 2 * product
+    assert count(jaxpr, taken=0.4) == pytest.approx((4 * 2 + 6) * product)
+
+
 def test_what_is_computed_again_counts_again():
     w = shape(8, 8)
     step = lambda x, w: jnp.sin(jnp.sin(x @ w) @ w).sum()  # noqa: E731
