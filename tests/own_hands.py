@@ -51,7 +51,7 @@ class Wearer:
         return joints
 
 
-def way(home, grip, goal_m, *, still_s=1.5):
+def way(home, grip, goal_m, *, still_s=1.5, slowness=1.0):
     """Return poses and pinches at the camera's rate: calibrate, grasp, carry to a goal, release."""
     above, there = np.array([0, -0.02, 0.08]), np.asarray(goal_m)
     stops = [
@@ -67,7 +67,7 @@ def way(home, grip, goal_m, *, still_s=1.5):
     ]
     moments, point = [], home.point_m
     for stop, seconds, pinches in stops:
-        steps = round(seconds * RATE)
+        steps = round(slowness * seconds * RATE)
         for number in range(1, steps + 1):
             at = point + number / steps * (stop - point)
             moments.append((replace(home, point_m=at), pinches))
@@ -77,7 +77,11 @@ def way(home, grip, goal_m, *, still_s=1.5):
 
 def film(path, joints):
     """Write the video of a camera that sees hands with these joints."""
-    write_video(path, np.stack([_render(hand) for hand in joints]), RATE)
+    frames = {}
+    for hand in joints:
+        if hand.tobytes() not in frames:
+            frames[hand.tobytes()] = _render(hand)
+    write_video(path, np.stack([frames[hand.tobytes()] for hand in joints]), RATE)
 
 
 def _render(joints):

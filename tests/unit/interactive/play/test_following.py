@@ -49,17 +49,16 @@ def carried(played, name, rng, *, facing):
     person = person_of(following, played, facing=facing, noise=rng)
     grip = pre_grasp_pose(played.scene, name, "right").point_m
     grip, goal = grip + rng.normal(0, 0.012, 3), grip + [0, 0.0, 0.12]
-    number, before = None, None
+    number, pinched = None, False
     for index, (pose, pinches) in enumerate(way(following.own.home, grip, goal)):
+        if pinched and not pinches:
+            break
         following.see(person.joints(pose, pinches=pinches), index / RATE)
         if following.own.phase == "follow" and not following.recorder.live:
             following.begin(played)
-        if before is not None and not pinches:
-            break
         if index % FORESEEN == 0 and following.recorder.live:
             number = following.foresee()[0].held
-        if pinches and before is None:
-            before = following.recorder.pose.point_m
+        pinched |= pinches
     foresight = following.foresee()[0]
     moved = foresight.poses[number][:3, 3] if number in foresight.poses else np.zeros(3)
     return played.state.names.get(number), moved
@@ -96,24 +95,17 @@ def test_the_poses_become_clips_that_are_undone_and_made_again(tmp_path):
     person, home = person_of(following, played), following.own.home
     clock = count()
 
-    def see(seconds, way_m=(0, 0, 0)):
-        for number in range(round(seconds * RATE)):
-            moved = np.array(way_m) * number / (seconds * RATE)
-            pose = replace(home, point_m=home.point_m + moved)
-            following.see(person.joints(pose), next(clock) / RATE)
+    def see(seconds):
+        for _ in range(round(seconds * RATE)):
+            following.see(person.joints(home), next(clock) / RATE)
             if following.own.phase == "follow" and not following.recorder.live:
                 following.begin(played)
 
     def take(number):
+        see(1.1)
         return following.recorder.take(number), np.zeros(6)
 
-    see(3)
-    assert following.recorder.wait_for_motion(0.0)
-    while following.recorder.wait_for_motion(0.0):  # it comes from where the episode begins
-        following.recorder.take(8)
-    assert not following.recorder.wait_for_motion(0.0)
-    following.begin(played)
-    see(2.5, (0.1, 0, 0))
+    see(1.5)  # calibrates, and comes from where the episode begins
     assert following.recorder.wait_for_motion(0.0)
     shown = []
     played.follow(take, "", lambda frames, last: shown.append((len(frames), last)))
@@ -122,9 +114,10 @@ def test_the_poses_become_clips_that_are_undone_and_made_again(tmp_path):
     following.committed(played)
     poses, _ = following.recorder.path()
     np.testing.assert_allclose(poses[0].point_m, played.hand.point_m, atol=1e-6)
-    assert 2 < len(poses) < 8
+    assert 2 < len(poses) < 10
     rows = played.session.rows(1)
-    assert np.linalg.norm(np.diff(rows[:, :3], axis=0), axis=1).max() < 1.0 / 8 + 0.01
+    # 1 m/s at 8 frames per second, and the wrist turns about the fingertips
+    assert np.linalg.norm(np.diff(rows[:, :3], axis=0), axis=1).max() < 1.0 / 8 + 0.05
     played.go_to(0)
     following.begin(played)
     np.testing.assert_allclose(following.recorder.pose.point_m, played.hand.point_m)
