@@ -26,7 +26,7 @@ def film_of_carry(path):
     home = OwnHand("right", wearer).home
     person = Wearer(home, wearer, facing=True)
     grip = pre_grasp_pose(scene, name, "right").point_m
-    moments = way(home, grip, [*goal, grip[2] + 0.01], still_s=6, slowness=1.5)
+    moments = way(home, grip, [*goal, grip[2] + 0.01], still_s=6, slowness=1.3)
     film(path, [person.joints(pose, pinches=pinches) for pose, pinches in moments])
 
 
@@ -52,7 +52,8 @@ def test_an_object_follows_the_hand_of_a_video(tmp_path):
         page.click("follow")
         page.wait_for_text("The video in place of a camera has ended")
         page.wait_for_text("the hand has opened")
-        page.wait_for_text("painted")
+        page.wait_for_text(", painted")
+        page.wait_for("document.body.innerText.includes('All motion is painted')", timeout_s=300)
         page.click("save")
         page.wait_for_text("episode.zip")
         page.wait_for_text("Paused")

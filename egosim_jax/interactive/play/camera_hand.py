@@ -130,6 +130,7 @@ class CameraHand:
         """Show the camera's frame, what is done with the hand, and how long it takes."""
         phase = self._following.own.phase
         lines = [PAUSED if self._paused and phase != "calibrate" else ABOUT[phase]]
+        lines += ["All motion is painted."] if self._following.recorder.rests else []
         lines += [quote_text(self._shots.ended)] if self._shots.ended else []
         times = [f"{name} {median(s):.2f} s" for name, s in self._latencies.items() if s]
         lines += [f"Median time from the camera's frame: {', '.join(times)}."] if times else []

@@ -22,6 +22,8 @@ class Recorder:
     def __init__(self, pose: Pose, *, fps: int):
         self._fps, self._changed = fps, threading.Condition()
         self._live = False
+        self.rests = False
+        """True once all motion is painted."""
         self.begin(pose)
 
     def begin(self, pose: Pose) -> None:
@@ -82,15 +84,17 @@ class Recorder:
                 self._changed.wait(timeout_s)
                 return False
             if any(_differs(pose, self._base()) for pose in self._poses[self._painted :]):
+                self.rests = False
                 return True
             del self._poses[self._painted : -1], self._times_s[self._painted : -1]
+            self.rests = True
             self._changed.wait(timeout_s)
             return False
 
     def take(self, count: int) -> Sequence[Pose]:
         """Return the next poses to paint, when they are there.
 
-        If twice as many wait, because painting is slower than the hand, the way becomes faster.
+        If twice as many wait, because painting is slow, every other one is left out.
         """
         with self._changed:
             self._changed.wait_for(
@@ -98,19 +102,14 @@ class Recorder:
             )
             waiting = self._poses[self._painted :] or [self._base()]
             times_s = self._times_s[self._painted :] or [self._time_s]
-            if len(waiting) >= 2 * count:
-                chosen = np.linspace(0, len(waiting) - 1, count + 1)[1:].round().astype(int)
-                poses, self.taken_s = [waiting[i] for i in chosen], times_s[-1]
-                self._poses[self._painted :], self._times_s[self._painted :] = (
-                    poses,
-                    [times_s[i] for i in chosen],
-                )
-            else:
-                poses, self.taken_s = waiting[:count], times_s[:count][-1]
-                poses += [poses[-1]] * (count - len(poses))
-                if self._painted + count > len(self._poses):
-                    self._poses[self._painted :] = poses
-                    self._times_s[self._painted :] = [self.taken_s] * count
+            used = 2 * count if len(waiting) >= 2 * count else min(count, len(waiting))
+            step = 2 if used > count else 1
+            poses, times_s = waiting[step - 1 : used : step], times_s[step - 1 : used : step]
+            self.taken_s = times_s[-1]
+            poses += [poses[-1]] * (count - len(poses))
+            times_s += [self.taken_s] * (count - len(times_s))
+            taken = slice(self._painted, self._painted + used)
+            self._poses[taken], self._times_s[taken] = poses, times_s
             self._painted += count
             return poses
 

@@ -147,8 +147,8 @@ def test_a_slow_painter_does_not_fall_behind(tmp_path, waiting):
     for number in range(1, waiting + 1):
         recorder.see(far, number / 8 + 1e-6)
     poses = recorder.take(8)
-    seen = waiting if waiting >= 16 else 8
+    seen = 16 if waiting >= 16 else 8
     way_m = poses[-1].point_m - played.hand.point_m
     assert way_m[2] == pytest.approx(min(seen / 8, 2.0), abs=1e-3)
-    assert len(recorder.path()[0]) == 2 + (8 if waiting >= 16 else waiting)
+    assert len(recorder.path()[0]) == 2 + (waiting - 8 if waiting >= 16 else waiting)
     played.close()
