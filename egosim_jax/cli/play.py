@@ -23,7 +23,11 @@ from egosim_jax.types import InputError, check_seed
 if TYPE_CHECKING:
     from egosim_jax.interactive.env.action_spec import ActionSpec
     from egosim_jax.interactive.env.backends import GeneratedWorld
-    from egosim_jax.interactive.play.viewer import LocalServer
+    from egosim_jax.interactive.play.camera_hand import CameraHand
+    from egosim_jax.interactive.play.local_server import LocalServer
+    from egosim_jax.interactive.play.viewer import Page
+    from egosim_jax.io.shots import Shots
+    from egosim_jax.perception.video.hands.litert import HandNetworks
     from egosim_jax.simulation.episode import Episode
     from egosim_jax.simulation.start import Start
 
@@ -50,6 +54,10 @@ class Play:
     """Episode whose scene is used, instead of a tabletop scene."""
     hand: Literal["right", "left"] = "right"
     """Hand that acts."""
+    camera: str | None = None
+    """Number of a camera, such as 0, or a video in its place, to move the hand by your own one.
+
+    Needs the extra `video`. The frames stay on this machine."""
     port: int = 8080
     """Port to listen on; 0 for a free one."""
     clips: Annotated[ClipOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ClipOptions)
@@ -71,6 +79,7 @@ class Play:
             from egosim_jax.io.executables import share_with_jax
             from egosim_jax.simulation.episode import Episode
 
+        watched = None if self.camera is None else self._watch(self.camera)
         share_with_jax()
         episode = None if self.episode is None else Episode.load(self.episode)
         loaded = load_backend(**vars(self.clips), default=MODEL, episode=episode)
@@ -88,12 +97,32 @@ class Play:
         with lock_folder(self.out):
             with phase("opens the page"):
                 server = self._serve()
-            Page(server, begin, PlayedEpisode(world, self.out, start, self.hand))
+            page = Page(server, begin, PlayedEpisode(world, self.out, start, self.hand))
+            followed = None if watched is None else self._follow(server, page, *watched)
             print("ready; Ctrl-C ends it", file=sys.stderr, flush=True)
             print(f"http://127.0.0.1:{server.get_port()}", flush=True)
             _wait()
+            if followed is not None:
+                followed.close()
             server.stop()
         return ExitCode.DONE
+
+    def _watch(self, camera: str) -> tuple[Shots, HandNetworks]:
+        """Open the camera, and load the networks that find a hand in its frames."""
+        from egosim_jax.io.shots import Shots
+        from egosim_jax.perception.video.hands.litert import HandNetworks, fetch_weights
+
+        with phase("opens the camera"):
+            networks = HandNetworks(*fetch_weights(), threads=1)
+            return Shots(camera), networks
+
+    def _follow(
+        self, server: LocalServer, page: Page, shots: Shots, networks: HandNetworks
+    ) -> CameraHand:
+        from egosim_jax.interactive.play.camera_hand import CameraHand
+        from egosim_jax.perception.video.hands.live import LiveHand
+
+        return CameraHand(server, page, shots, LiveHand(networks, self.hand))
 
     def _start(self, world: GeneratedWorld, spec: ActionSpec, episode: Episode | None) -> Start:
         from egosim_jax.simulation.start import Start
@@ -104,7 +133,7 @@ class Play:
         return Start.of(episode, seed=int(seed) if seed.isdecimal() else self.seed)
 
     def _serve(self) -> LocalServer:
-        from egosim_jax.interactive.play.viewer import LocalServer
+        from egosim_jax.interactive.play.local_server import LocalServer
 
         with contextlib.redirect_stdout(sys.stderr):  # viser prints a banner
             return LocalServer(HOST, self.port)

@@ -70,11 +70,7 @@ class Prediction:
     @classmethod
     def of(cls, state: SceneState, action: Action, *, fps: int = 8) -> Prediction:
         """Read the hands of an action and the objects of a state. Points without an id rest."""
-        tracks = {
-            hand: track
-            for hand in range(action.joints_m.shape[1])
-            if (track := track_hand(np.asarray(action.joints_m[:, hand], float), action.kind))
-        }
+        tracks = _tracks(action)
         reached = [track.joints_m.reshape(-1, 3) for track in tracks.values()]
         scene = level_scene(
             state,
@@ -89,6 +85,11 @@ class Prediction:
             first=_first_solids(scene, state.world_from_object),
             fps=fps,
         )
+
+    def with_hands(self, action: Action) -> Prediction:
+        """Return the prediction of another action, whose hands reach no other objects."""
+        tracks = {hand: _in_level(track, self.scene) for hand, track in _tracks(action).items()}
+        return replace(self, tracks=tracks)
 
     def with_object(self, number: int, points_m: Points) -> Prediction:
         """Return the prediction with one more object, which has no id in the state."""
@@ -153,6 +154,15 @@ def predict(state: SceneState, action: Action, *, fps: int = 8) -> Motion:
     `fps` is the rate of the action's frames. Points without an id do not move.
     """
     return Prediction.of(state, action, fps=fps).motion()
+
+
+def _tracks(action: Action) -> dict[int, HandTrack]:
+    """Return the track of each hand of an action that is in view."""
+    return {
+        hand: track
+        for hand in range(action.joints_m.shape[1])
+        if (track := track_hand(np.asarray(action.joints_m[:, hand], float), action.kind))
+    }
 
 
 def _in_level(track: HandTrack, scene: LevelScene) -> HandTrack:

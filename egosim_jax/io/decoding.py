@@ -264,16 +264,25 @@ def _whole_packets(stream: VideoStream) -> Iterator[Packet | None]:
 
 
 def to_rgb(
-    stream: VideoStream, frame: VideoFrame, decoding: Decoding, scaler: VideoReformatter
+    stream: VideoStream,
+    frame: VideoFrame,
+    decoding: Decoding,
+    scaler: VideoReformatter,
+    *,
+    max_side: int | None = None,
 ) -> np.ndarray:
     """Return a decoded frame of a stream as it is shown: upright RGB `h w 3` of square pixels.
 
-    Frames of a stream share a scaler: a new one needs seconds to prepare for a wide gamut.
+    A frame with a side above `max_side` is shrunk to it. Frames of a stream share a scaler: a new
+    one needs seconds to prepare for a wide gamut.
     """
     wide = frame.color_primaries in _WIDE_GAMUT and decoding == "accurate"
+    width, height = _square_width(stream, frame.width), frame.height
+    factor = min(1.0, (max_side or max(width, height)) / max(width, height))
     frame_rgb = scaler.reformat(
         frame,
-        width=_square_width(stream, frame.width),
+        width=max(1, round(factor * width)),
+        height=max(1, round(factor * height)),
         format="rgb24",
         interpolation=_SCALERS[decoding],
         dst_color_primaries=ColorPrimaries.BT709 if wide else None,

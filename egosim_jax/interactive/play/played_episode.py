@@ -168,18 +168,52 @@ class PlayedEpisode:
         A causal student asks for them again before each part of the clip, so the hand changes
         course while the clip is made. `show` is used as in `step`.
         """
-        counts = part_rows(self.world.chunk_frames)
+        counts = list(part_rows(self.world.chunk_frames))
+        target, planned = None, np.zeros((0, 0))
+
+        def rows_of(count: int, row: Float[np.ndarray, " d"]) -> Float[np.ndarray, "k d"]:
+            nonlocal target, planned
+            hand, camera = aim()
+            aimed = hand.row(self.side, camera)
+            if target is None or not np.allclose(aimed, target):
+                poses = drive(Pose.of_row(row, self.side), hand, sum(counts) + 1)
+                target, planned = aimed, self._rows(poses, row, camera)
+            counts.pop(0)
+            rows, planned = planned[:count], planned[count:]
+            return rows
+
+        return self._make_parts(rows_of, caption, show)
+
+    def follow(
+        self,
+        take: Callable[[int], tuple[Sequence[Pose], Float[np.ndarray, " 6"]]],
+        caption: str,
+        show: Callable[[Frames, bool], None],
+    ) -> Timing:
+        """Make a clip of the poses that a hand went through, and of the camera where it should be.
+
+        `take` returns the next poses, as many as the next part of the clip has rows. It may wait
+        for them. `show` is used as in `step`.
+        """
+
+        def rows_of(count: int, row: Float[np.ndarray, " d"]) -> Float[np.ndarray, "k d"]:
+            poses, camera = take(count)
+            return self._rows(poses, row, camera)
+
+        return self._make_parts(rows_of, caption, show)
+
+    def _make_parts(
+        self,
+        rows_of: Callable[[int, Float[np.ndarray, " d"]], Float[np.ndarray, "k d"]],
+        caption: str,
+        show: Callable[[Frames, bool], None],
+    ) -> Timing:
+        """Make a clip part by part, of the rows that follow a row."""
 
         def make(number: int, shown: Callable[[Frames], None]) -> Result:
-            row, target, planned = self.row, None, np.zeros((0, 0))
-            result: Result | None = None
-            for part, count in enumerate(counts, start=1):
-                hand, camera = aim()
-                aimed = hand.row(self.side, camera)
-                if target is None or not np.allclose(aimed, target):
-                    poses = drive(Pose.of_row(row, self.side), hand, sum(counts[part - 1 :]) + 1)
-                    target, planned = aimed, self._rows(poses, row, camera)
-                rows, planned = planned[:count], planned[count:]
+            row, result = self.row, None
+            for part, count in enumerate(part_rows(self.world.chunk_frames), start=1):
+                rows = rows_of(count, row)
                 result = self._parts.step(self.session, number, part, rows, caption, shown)
                 row = result.row
             return cast(Result, result)

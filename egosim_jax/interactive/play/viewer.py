@@ -10,16 +10,14 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
 
 import cv2
 import numpy as np
 import viser
 import viser.transforms as tf
 from jaxtyping import Float, UInt8
-from websockets.asyncio import server
 
-from egosim_jax.interactive.origins import is_local
+from egosim_jax.interactive.play.foresight import Foresight
 from egosim_jax.interactive.play.moves import (
     Interaction,
     Pose,
@@ -28,6 +26,7 @@ from egosim_jax.interactive.play.moves import (
     pre_grasp_pose,
 )
 from egosim_jax.interactive.play.played_episode import Frames, Moment, PlayedEpisode, Timing
+from egosim_jax.interactive.play.state_cloud import StateCloud
 from egosim_jax.io.bounded import quote_text
 from egosim_jax.io.writing import write_video
 from egosim_jax.types import InputError
@@ -53,38 +52,12 @@ BACKGROUND = (206, 213, 220)
 """Color behind the scene, in which white objects and gaps of the state are seen."""
 NOTHING: tuple[str, ...] = ("-",)
 """Placeholder of an empty list."""
+CLOSURE_STEP = 0.01
+"""Change of the closure after which a moving hand is drawn again."""
+Take = Callable[[int], Sequence[Pose]]
+"""Function that returns the next poses to paint."""
 PREVIEW_S = 0.1
 """Minimum time between two previews, in seconds."""
-
-
-class LocalServer(viser.ViserServer):
-    """Page server for this machine alone: no foreign page and no public tunnel reaches it."""
-
-    def __init__(self, host: str, port: int) -> None:
-        # viser has no option for checks: it takes its websocket server from this module, here.
-        serve = server.serve
-        server.serve = partial(_serve_locally, serve)  # pyright: ignore[reportAttributeAccessIssue]
-        try:
-            super().__init__(host, port, verbose=False)
-        finally:
-            server.serve = serve
-
-    def request_share_url(self, verbose: bool = True) -> None:
-        """Refuse to publish the page."""
-
-
-def _serve_locally(serve: Any, *args: Any, process_request: Any, **options: Any) -> Any:
-    """Start a server of websockets that refuses requests of foreign pages."""
-
-    def check(connection: Any, request: Any) -> Any:
-        hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
-        if len(hosts) != 1 or not all(is_local(hosts[0], origin) for origin in origins or [None]):
-            return connection.respond(
-                403, "The request is not from this page: open it as localhost or 127.0.0.1.\n"
-            )
-        return process_request(connection, request)
-
-    return serve(*args, process_request=check, **options)
 
 
 class Page:
@@ -95,8 +68,12 @@ class Page:
     ):
         """Show an episode; `new` begins another one from a seed."""
         self._server, self._new, self.played = server, new, played
-        self._changing, self._waiting = threading.Lock(), threading.Lock()
+        self.changing, self._waiting = threading.Lock(), threading.Lock()
         self._stale, self._shown = threading.Event(), 0
+        self.live = False
+        """True while the hand of a camera moves; it is not placed by the page then."""
+        self.before_change: Callable[[], None] = lambda: None
+        """Called before a person changes the episode by a control."""
         self._filling = False  # viser also calls back for values that the page itself sets
         self._make_scene()
         self._make_controls()
@@ -109,10 +86,7 @@ class Page:
         scene.set_background_image(np.full((1, 1, 3), BACKGROUND, np.uint8))
         first = self._server.initial_camera
         first.position, first.look_at, first.fov = (0.5, -0.42, 0.55), (0.0, 0.22, 0.0), 0.9
-        self._cloud = scene.add_point_cloud(
-            "/state", np.zeros((1, 3)), np.zeros((1, 3), np.uint8), point_size=0.0022,
-            point_shading="flat",
-        )  # fmt: skip
+        self._cloud = StateCloud(scene)
         self._gizmo = scene.add_transform_controls("/hand", scale=0.12, depth_test=False)
         self._skin: viser.MeshHandle | None = None
         low, high = (REACH_M[0], REACH_M[2]), (REACH_M[1], REACH_M[3])
@@ -144,13 +118,15 @@ class Page:
         self._images = [gui.add_image(blank, label=label, jpeg_quality=90)]
         gui.add_markdown(HELP)
         self._status = gui.add_markdown("")
+        self.top = self._status.order
+        """Order of the last control above the folders."""
         with gui.add_folder("Act"):
             self._object: viser.GuiDropdownHandle[str] = gui.add_dropdown("Object", NOTHING)
             acts = {label: partial(self._interact, act) for label, act in INTERACTIONS}
             self._choose("Let the hand", acts)
         with gui.add_folder("Hand"):
             self._closure = gui.add_slider("Grasp", 0.0, 1.0, 0.01, 0.25)
-            self._closure.on_update(lambda _: self._draw_hand())
+            self._closure.on_update(lambda _: self._draw_hand(float(self._closure.value)))
             moves = {"aim at the object": self._aim, "move where it is shown": self._drive}
             self._choose("Let the hand", moves)
         with gui.add_folder("Camera", expand_by_default=False):
@@ -177,10 +153,11 @@ class Page:
 
     def _change(self, run: Callable[[], None]) -> None:
         """Run a change of the episode, unless another change already waits."""
+        self.before_change()
         if not self._waiting.acquire(blocking=False):  # at most one waits: clicks do not pile up
             return
         try:
-            with self._changing:
+            with self.changing:
                 self._waiting.release()
                 self._shown += 1  # ends a running replay
                 run()
@@ -243,6 +220,43 @@ class Page:
     def _step(self, poses: Sequence[Pose], caption: str) -> None:
         self._run(caption, lambda show: self.played.step(poses, self._camera, caption, show))
 
+    def paint(self, take: Take, first: Callable[[], None], made: Callable[[], None]) -> None:
+        """Make a clip of the poses of a camera's hand, unless a change by a person waits.
+
+        `take` as in `PlayedEpisode.follow`; `first` is called at each group of frames, and `made`
+        once the state is updated.
+        """
+        if self._waiting.locked():
+            time.sleep(PREVIEW_S)
+            return
+        with self.changing:
+            self._shown += 1
+            played, caption = self.played, self.played.now.start.prompt
+
+            def make(show: Callable[[Frames, bool], None]) -> Timing:
+                def shown(frames: Frames, last: bool) -> None:
+                    show(frames, last)
+                    first()
+
+                timing = played.follow(lambda n: (take(n), self._camera), caption, shown)
+                made()
+                return timing
+
+            self._run(caption, make)
+
+    def show_hand(self, hand: Pose) -> None:
+        """Show the hand of a camera."""
+        with self._server.atomic():
+            self._gizmo.position = hand.point_m
+            self._gizmo.wxyz = tf.SO3.from_matrix(hand.rotation).wxyz
+            if abs(hand.closure - self._drawn) > CLOSURE_STEP:
+                self._draw_hand(hand.closure)
+
+    def show_objects(self, foresight: Foresight) -> None:
+        """Show the objects where they are predicted."""
+        with self._server.atomic():
+            self._cloud.move(foresight.start.state, foresight.poses)
+
     def _run(self, caption: str, make: Callable[[Callable[[Frames, bool], None]], Timing]) -> None:
         """Make a clip, and show its frames as they are decoded and its latency."""
         self._status.content = "Generating…"
@@ -262,7 +276,8 @@ class Page:
         ]
         self._status.content = "  \n".join(map(quote_text, lines))
         self._refresh()
-        self._replay_later([self.played.now])
+        if not self.live:
+            self._replay_later([self.played.now])
 
     def _open(self) -> None:
         """Show a new episode."""
@@ -278,10 +293,8 @@ class Page:
     def _refresh(self) -> None:
         """Show the current moment."""
         played, now = self.played, self.played.now
-        state = played.state
         with self._server.atomic():
-            self._cloud.points = state.points_m
-            self._cloud.colors = state.colors
+            self._cloud.show(played.state)
         self._filling = True
         captions = [f"{n}: {moment.caption}" for n, moment in enumerate(played.moments)]
         self._past.options = captions
@@ -289,7 +302,8 @@ class Page:
         for slider, (_, number, _) in zip(self._moved, CAMERA, strict=True):
             value = played.row[-6:][number]
             slider.value = round(float(np.degrees(value) if number > 2 else 100 * value), 1)
-        self._place(played.hand)
+        if not self.live:
+            self._place(played.hand)
         self._filling = False
         self._images[0].image = _large(now.frames[-1])
         self._images[1].visible = now.truth is not None
@@ -301,24 +315,26 @@ class Page:
         self._gizmo.position = hand.point_m
         self._gizmo.wxyz = tf.SO3.from_matrix(hand.rotation).wxyz
         self._closure.value = round(hand.closure, 2)
-        self._draw_hand()
+        self._draw_hand(self._closure.value)
 
-    def _draw_hand(self) -> None:
-        joints = joints_of("human", float(self._closure.value), self.played.side)
+    def _draw_hand(self, closure: float) -> None:
+        joints = joints_of("human", closure, self.played.side)
         joints = joints - pinch(joints)[0]
         elbow, back = joints[0] - [0, 0.25, 0], np.array([0.0, 0.0, 1.0])
         skin = hand_meshes(joints, elbow, "human", back)[0]
         self._skin = self._server.scene.add_mesh_simple(
             "/hand/skin", skin.vertices_m, skin.triangles, color=SKIN, opacity=0.85
         )
-        self._stale.set()
+        self._drawn = closure
+        if not self.live:
+            self._stale.set()
 
     def _keep_preview(self) -> None:
         """Redraw the wearer's view whenever hand, camera or state has changed."""
         while True:
             self._stale.wait()
             self._stale.clear()
-            if self._changing.acquire(timeout=5):
+            if self.changing.acquire(timeout=5):
                 try:
                     pose = self.played.camera(self._camera)
                     self._eye.image = self.played.preview(self._hand, self._camera)
@@ -327,7 +343,7 @@ class Page:
                 except InputError as error:
                     self._tell("Not visible", str(error))
                 finally:
-                    self._changing.release()
+                    self.changing.release()
             time.sleep(PREVIEW_S)
 
     def _return(self) -> None:

@@ -149,7 +149,7 @@ def find_other_side(
     places = regions_of_joints(hands.joints_px)
     for turn, scale in _OTHER_REGIONS:
         regions = replace(places, angle=places.angle + turn, size_px=places.size_px * scale)
-        refined = _find_joints(frames, networks, hands.frame, regions, 0.0)
+        refined = find_joints(frames, networks, hands.frame, regions, 0.0)
         refined = replace(
             refined,
             palm=hands.palm,
@@ -182,7 +182,7 @@ def find_candidates(
         np.concatenate([np.zeros((0, 4)), *(p.boxes_px for p in palms)]),
         np.concatenate([np.zeros((0, 7, 2)), *(p.keypoints_px for p in palms)]),
     )
-    candidates = _find_joints(frames, networks, numbers, regions, min_presence)
+    candidates = find_joints(frames, networks, numbers, regions, min_presence)
     candidates = _once(candidates, same_hand)
     fresh = candidates
     allowed = np.ones(len(frames), bool) if wanted is None else wanted
@@ -190,7 +190,7 @@ def find_candidates(
         ahead = _followed(fresh, candidates, allowed, same_hand)
         if not len(ahead):
             break
-        fresh = _find_joints(
+        fresh = find_joints(
             frames, networks, ahead.frame, regions_of_joints(ahead.joints_px), min_presence
         )
         fresh = _new_ones(_once(fresh, same_hand), candidates, same_hand)
@@ -227,7 +227,7 @@ def _find_palms(
     return palms
 
 
-def _find_joints(
+def find_joints(
     frames: np.ndarray,
     networks: HandNetworks,
     numbers: np.ndarray,
@@ -262,7 +262,7 @@ def _refined(
     same_hand: float,
 ) -> Candidates:
     """Return candidates averaged with a second detection in the region of their keypoints."""
-    again = _find_joints(
+    again = find_joints(
         frames, networks, candidates.frame, regions_of_joints(candidates.joints_px), 0.0
     )
     same = relative_distance(again.joints_px, candidates.joints_px) <= same_hand

@@ -30,7 +30,7 @@ def test_which_requests_are_local(host, origin, local):
 
 @pytest.fixture(scope="module")
 def port():
-    from egosim_jax.interactive.play.viewer import LocalServer
+    from egosim_jax.interactive.play.local_server import LocalServer
 
     server = LocalServer("127.0.0.1", 0)
     yield server.get_port()
