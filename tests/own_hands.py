@@ -28,7 +28,7 @@ class Wearer:
     """A right hand of a person in view of a camera, moved as a hand in the workspace would."""
 
     def __init__(self, home, wearer, *, facing, noise=None):
-        """Stand before a camera, or wear it; `noise` draws errors of a network."""
+        """Place the hand before a camera, or below it; `noise` draws errors of a network."""
         self._home, self._noise = home, noise
         self._world_from_camera = FACING if facing else wearer
         x = -1.0 if facing else 1.0  # the palm faces a camera in front, the back one on the head

@@ -54,7 +54,7 @@ MAX_TWIST_DEG, MAX_TILT_DEG = 60.0, 30.0
 PALM_WIDTH_M, PALM_LENGTH_M = 0.045, 0.08
 """Size of a palm, over which noise turns it, in meters."""
 FIRST_FRAMES = 5
-"""Frames of a noisy hold of which the most typical one gives the palm's first direction."""
+"""Number of frames at the beginning of a noisy hold; the most typical one is its direction."""
 TURNED_SHARE = 0.8
 """Share of a hold's frames that are below its typical largest turn; the rest may be outliers."""
 WIDE_M = 0.01

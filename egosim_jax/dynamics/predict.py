@@ -126,7 +126,7 @@ class Prediction:
         return _motion(walk, self.scene)
 
     def _holds(self, hand: int, track: HandTrack) -> list[Hold]:
-        """Return the possible holds of a hand, first that of what it held before."""
+        """Return the possible holds of a hand, which may begin with what it held before."""
         held_on = self.held_before.get(hand) in self.scene.solids and track.present[0]
         return [*([first_hold(track)] if held_on and track.sigma_m else []), *find_holds(track)]
 

@@ -47,7 +47,7 @@ class Shots:
     def __init__(self, source: str):
         """Open a camera by its number, or else a video file, and wait for the first frame.
 
-        Raises `InputError` if there is none.
+        Raises `InputError` without one.
         """
         self.ended = ""
         """Why there are no more frames; empty while there are."""

@@ -34,8 +34,7 @@ WALL_AREA_M2, WALL_TILT_DEG = 0.25, 50.0
 MAX_WALLS = 4
 """Maximum number of walls."""
 MAX_APART = 0.02
-"""Maximum difference in depth of a pixel and the subsampled one that it has its object of, as a
-share."""
+"""Maximum relative difference in depth of a pixel and the subsampled one that gives its object."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,8 +263,8 @@ def _refine(
 ) -> Int32[np.ndarray, "r c"]:
     """Return labels at the size of the image.
 
-    Each pixel has the label of its subsampled pixel if that is as deep, or else that of the
-    neighbor of the nearest depth. The edge of an object would stay behind where it stood.
+    Each pixel has the label of its subsampled pixel if that is as deep, or else of the neighbor
+    of the nearest depth. The edge of an object would stay behind where it stood.
     """
     if every == 1:
         return labels

@@ -33,17 +33,17 @@ ABOUT: dict[Phase, str] = {
     "retreat": "Your hand is not seen: the hand has opened and goes back. Show yours again.",
 }
 BEGIN = "Press *follow*, then hold your open hand still in the camera's view for a second."
-PAUSED = "Paused: press *follow* to go on."
+PAUSED = "Paused: press *follow* to continue."
 LATE_S = 0.5
 """Time without a frame after which the hand counts as not seen, in seconds."""
 FORESEE_S = 0.05
 """Minimum time between two predictions, in seconds."""
-PICTURE_S = 0.15
+SHOWN_S = 0.15
 """Minimum time between two of the camera's frames on the page, in seconds."""
 WIDTH = 320
 """Width of the camera's frames on the page in pixels."""
 COUNTED = 300
-"""Number of the last latencies of which the page shows the median."""
+"""Number of the last latencies; the page shows their median."""
 
 
 class CameraHand:
@@ -55,11 +55,11 @@ class CameraHand:
         self._following = Following(page.played)
         self._latencies = {name: deque(maxlen=COUNTED) for name in ("hand", "objects", "painted")}
         self._ended, self._begun, self._paused = threading.Event(), threading.Event(), False
-        self._told_s = self._painted_s = self._shot_s = 0.0
+        self._shown_s = self._painted_s = self._shot_s = 0.0
         page.before_change = self._pause
         with server.gui.add_folder("Your hand", order=page.top + 0.5):
             self._about = server.gui.add_markdown(BEGIN)
-            self._picture = server.gui.add_image(np.zeros((1, 1, 3), np.uint8), label="Camera")
+            self._camera = server.gui.add_image(np.zeros((1, 1, 3), np.uint8), label="Camera")
             names = ("follow", "pause", "calibrate again")
             group = server.gui.add_button_group("The hand", names)
             group.on_click(lambda event: self._choose(event.target.value))
@@ -122,12 +122,12 @@ class CameraHand:
             with self._page.changing:
                 self._following.begin(self._page.played)
                 self._page.live = True
-        if time.monotonic() - self._told_s > PICTURE_S:
-            self._told_s = time.monotonic()
+        if time.monotonic() - self._shown_s > SHOWN_S:
+            self._shown_s = time.monotonic()
             self._tell(shot)
 
     def _tell(self, shot: Shot | None) -> None:
-        """Show the camera's frame, what is done with the hand, and how long it takes."""
+        """Show the camera's frame, the hand's phase, and the median latencies."""
         phase = self._following.own.phase
         lines = [PAUSED if self._paused and phase != "calibrate" else ABOUT[phase]]
         lines += ["All motion is painted."] if self._following.recorder.rests else []
@@ -137,7 +137,7 @@ class CameraHand:
         if (about := "  \n".join(lines)) != self._about.content:
             self._about.content = about
         if shot is not None:
-            self._picture.image = picture(shot, self._tracker.joints_px)
+            self._camera.image = marked(shot, self._tracker.joints_px)
 
     def _foresee(self) -> None:
         """Draw the objects where the poses so far move them."""
@@ -166,7 +166,7 @@ class CameraHand:
         )
 
 
-def picture(shot: Shot, joints_px: np.ndarray | None) -> np.ndarray:
+def marked(shot: Shot, joints_px: np.ndarray | None) -> np.ndarray:
     """Return a small frame of a camera with the bones of the hand."""
     scale = WIDTH / shot.frame.shape[1]
     small = cv2.resize(shot.frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

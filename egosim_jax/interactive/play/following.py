@@ -35,7 +35,7 @@ class Following:
         self.show(played)
 
     def show(self, played: PlayedEpisode) -> None:
-        """Take the start of an episode's current moment as that of the recorded poses."""
+        """Begin the recorded poses at an episode's current moment."""
         now = played.now.start
         spec, fps = played.session.actions, played.world.video.fps
         with self._foreseeing:

@@ -2,8 +2,8 @@
 
 A hand of a camera has 21 joints in meters in the camera's axes (`perception/video/hands/live.py`).
 It is calibrated by an open hand that is held still: its place becomes the middle of the workspace,
-and its rotation that of a hand that is about to grasp. From then on the hand in the workspace moves
-and turns as it does. The side of the hand that the camera sees tells where the camera is:
+and its rotation the one before a grasp. From then on the hand in the workspace moves and turns
+alike. The side of the hand that the camera sees shows where the camera is:
 
     back    on the wearer's head: the axes of the wearer's camera
     palm    in front of the wearer: its x points to the wearer's left, and its z to the wearer
@@ -36,8 +36,9 @@ STILL_M, STILL_DEG = np.array([0.05, 0.05, 0.10]), 25.0
 HOLD_S = 0.4
 """Time without a hand after which the hand opens and retreats, in seconds."""
 PINCH, OPEN = 0.45, 0.6
-"""Distance of thumb and index finger, in lengths of the palm, below which a hand pinches, and above
-which it opens again."""
+"""Distances of thumb and index finger below which a hand pinches and above which it opens.
+
+In lengths of the palm."""
 HEIGHT_M = 0.13
 """Height of the hand above the table at its calibrated place, in meters."""
 FACING = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])

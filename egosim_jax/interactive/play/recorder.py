@@ -17,7 +17,7 @@ STILL_M, STILL_DEG, STILL_CLOSURE = 0.01, 5.0, 0.02
 
 
 class Recorder:
-    """Poses of a hand since a moment, of which the first ones are painted."""
+    """Poses of a hand since a moment; the first ones are painted."""
 
     def __init__(self, pose: Pose, *, fps: int):
         self._fps, self._changed = fps, threading.Condition()
@@ -94,7 +94,7 @@ class Recorder:
     def take(self, count: int) -> Sequence[Pose]:
         """Return the next poses to paint, when they are there.
 
-        If twice as many wait, because painting is slow, every other one is left out.
+        If twice as many wait, because painting is slow, every other one is skipped.
         """
         with self._changed:
             self._changed.wait_for(

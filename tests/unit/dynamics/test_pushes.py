@@ -1,4 +1,4 @@
-"""What a hand pushes, and what it lets in, on boxes of points."""
+"""Pushes of boxes of points by hands, and boxes that hands do not push."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shots of a camera or of a video in its place, and what is said where there are none."""
+"""Shots of a camera or of a video in its place, and the errors without them."""
 
 import time
 
@@ -78,7 +78,7 @@ class Unplugged:
         pass
 
 
-def test_a_camera_that_stops_is_told(monkeypatch):
+def test_a_camera_that_stops_is_reported(monkeypatch):
     monkeypatch.setattr(cv2, "VideoCapture", Unplugged)
     monkeypatch.setattr(shots, "DEAD_S", 0.1)
     source = Shots("0")

@@ -102,7 +102,7 @@ def test_a_subsampled_image_has_the_same_objects():
 @pytest.mark.parametrize("max_width", [160, 107])
 def test_the_edge_of_an_object_belongs_to_it_in_a_subsampled_image(max_width):
     view = cameras(1, height=192, width=320)
-    box = replace(GREEN, size_m=(0.06, 0.06, 0.15))  # far before what is behind its edge
+    box = replace(GREEN, size_m=(0.06, 0.06, 0.15))  # far before the table behind its edge
     _, depth, ids = cast([box], view)
     labels, _ = search([box], view=view, max_width=max_width)
     jumps = np.diff(depth, axis=0) < -0.05 * depth[1:]

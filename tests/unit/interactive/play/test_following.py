@@ -43,7 +43,7 @@ def person_of(following, played, *, facing=True, noise=None):
 def carried(played, name, rng, *, facing):
     """Return the object that follows a hand which pinches at an object, and the way of both.
 
-    The place of the pinch is off by 12 mm, and the joints are those of a noisy network.
+    The place of the pinch is off by 12 mm, and a noisy network finds the joints.
     """
     following = Following(played)
     person = person_of(following, played, facing=facing, noise=rng)
