@@ -82,7 +82,7 @@ class Prediction:
             scene=scene,
             tracks={hand: _in_level(track, scene) for hand, track in tracks.items()},
             held_before=state.held,
-            first=_first_solids(scene, state.world_from_object),
+            first=first_solids(scene, state.world_from_object),
             fps=fps,
         )
 
@@ -177,7 +177,7 @@ def _in_level(track: HandTrack, scene: LevelScene) -> HandTrack:
     )
 
 
-def _first_solids(scene: LevelScene, poses: Mapping[int, Pose]) -> dict[int, Solid]:
+def first_solids(scene: LevelScene, poses: Mapping[int, Pose]) -> dict[int, Solid]:
     """Return the objects that have moved as they stood in the first state."""
     level, solids = scene.level_from_world, {}
     for number in poses.keys() & scene.solids.keys():

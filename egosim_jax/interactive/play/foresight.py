@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from egosim_jax.dynamics import Prediction
 from egosim_jax.dynamics.level import level_scene
-from egosim_jax.dynamics.predict import REACH_M
+from egosim_jax.dynamics.predict import REACH_M, first_solids
 from egosim_jax.dynamics.solids import Solid
 from egosim_jax.geometry import transform
 from egosim_jax.interactive.env.action_spec import ActionSpec
@@ -59,10 +59,12 @@ class Foresight:
     def of(cls, start: Start, spec: ActionSpec, side: Side, *, fps: int) -> Foresight:
         """Read the objects of a start."""
         camera, corners = start.camera.world_from_camera[0], np.array(spec.workspace_m)
+        level = level_scene(start.state, camera, corners, reach_m=REACH_M)
         scene = Prediction(
-            scene=level_scene(start.state, camera, corners, reach_m=REACH_M),
+            scene=level,
             tracks={},
             held_before=start.state.held,
+            first=first_solids(level, start.state.world_from_object),
             fps=fps,
         )
         return cls(scene=scene, start=start, spec=spec, side=side, held=start.state.held.get(0))
