@@ -5,10 +5,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from egosim_jax import configs
 from egosim_jax.dynamics.hands import PALM
-from egosim_jax.interactive.play.own_hand import FACING
+from egosim_jax.interactive.play.moves import pre_grasp_pose, suggest_goal
+from egosim_jax.interactive.play.own_hand import FACING, OwnHand
 from egosim_jax.io.writing import write_video
 from egosim_jax.perception.video.hands.live import FOCAL
+from egosim_jax.worlds.tabletop import start_of_sequence
 from egosim_jax.worlds.tabletop.hands import frame_of, hand_meshes, joints_of, pinch
 from egosim_jax.worlds.tabletop.raycast import Placed, RayCaster
 
@@ -73,6 +76,18 @@ def way(home, grip, goal_m, *, still_s=1.5, slowness=1.0):
             moments.append((replace(home, point_m=at), pinches))
         point = stop
     return moments
+
+
+def film_of_carry(path, seed):
+    """Write the video of a hand that carries the suggested object to a place, as in a mirror."""
+    scene, camera, *_ = start_of_sequence(seed, spec=configs.get("tabletop").video)
+    name, goal = suggest_goal(scene, "right")
+    wearer = camera.world_from_camera[0, :3, :3]
+    home = OwnHand("right", wearer).home
+    person = Wearer(home, wearer, facing=True)
+    grip = pre_grasp_pose(scene, name, "right").point_m
+    moments = way(home, grip, [*goal, grip[2] + 0.01], still_s=6, slowness=1.3)
+    film(path, [person.joints(pose, pinches=pinches) for pose, pinches in moments])
 
 
 def film(path, joints):

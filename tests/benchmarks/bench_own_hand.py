@@ -15,7 +15,9 @@ import tempfile
 from pathlib import Path
 
 from tests.browser import browse, playing
-from tests.system.test_play_camera import film_of_carry
+from tests.own_hands import film_of_carry
+
+SEED = 1
 
 
 def main():
@@ -24,9 +26,9 @@ def main():
         folder = Path(name)
         video = Path(sys.argv[1]) if len(sys.argv) > 1 else folder / "hand.mp4"
         if len(sys.argv) == 1:
-            film_of_carry(video)
+            film_of_carry(video, SEED)
         with (
-            playing(folder / "runs", "--seed", "1", "--camera", video) as url,
+            playing(folder / "runs", "--seed", str(SEED), "--camera", video) as url,
             browse(url, folder) as page,
         ):
             page.wait_for_text("Press follow")
