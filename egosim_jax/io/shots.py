@@ -152,7 +152,7 @@ def _played(path: Path) -> Generator[np.ndarray]:
     with open_regular(path) as file, open_video(file, name) as stream:
         for number, frame in enumerate(decode_frames(stream, name)):
             rgb = to_rgb(stream, frame, "accurate", scaler, max_side=MAX_SIDE)
-            step = stream.time_base  # the last frames of a decoder have none of their own
+            step = stream.time_base  # the last frames of a decoder have no unit
             at_s = number / 30 if frame.pts is None or not step else float(frame.pts * step)
             if not number:
                 begun_s = time.monotonic() - at_s
