@@ -49,6 +49,8 @@ LEAVE_M = (0.003, 0.010)
 """Distances of flesh and of the pinch point at which a hand has left an object, in meters."""
 CLOSES_SOON = 3
 """Frames before a grip in which the hand does not push the object that it closes on."""
+CLOSES_M = 0.0001
+"""Change of the opening of a hand that closes, in meters a frame."""
 FITS_M = 0.012
 """Excess width of an object that still fits in an open hand, in meters: hulls err."""
 OVERLAP_M = 0.004
@@ -180,8 +182,8 @@ def _yields(
 ) -> Bool[np.ndarray, " p"]:
     """Return which points of a hand yield to an object, because the hand reaches around it.
 
-    The object must fit in the hand. Fingers yield while it is between thumb and fingers. Before,
-    all points yield that come down on it.
+    The object must fit in the hand. Fingers that close on it yield while it is between thumb and
+    fingers. All points yield that come down on it. A noisy hand may close unseen.
     """
     track, solid, pose = walk.tracks[hand], walk.solids[number], walk.poses[number]
     thumb, fingers = track.tips_m[walk.frame]
@@ -193,7 +195,9 @@ def _yields(
     falls = -way_m[:, 2] > DESCENT * np.linalg.norm(way_m[:, :2], axis=1)
     first, second = (solid.normal(tip, pose)[1] @ opening / size for tip in (thumb, fingers))
     around = first < -FACING and second > FACING
-    return falls | _fingers(track.kind) if around else falls
+    change_m = float(np.diff(track.opening_m[walk.frame - 1 : walk.frame + 1])[0])
+    closes = track.sigma_m > 0 or change_m < -CLOSES_M
+    return falls | _fingers(track.kind) if around and closes else falls
 
 
 def push_out(
