@@ -31,6 +31,8 @@ FLESH_M: dict[Kind, float] = {"human": 0.008, "robot": 0.006}
 """Radius of flesh around joints and bones, in meters."""
 JAW_SHARES = (0.2, 0.4, 0.6)
 """Places of touching points along a jaw, from its tip, as fractions of the way to the wrist."""
+RIM_M = 0.003
+"""Depth below the top of an object up to which a point glances off it, in meters."""
 STEEP = 0.7
 """Vertical component of a normal above which a point presses on an object."""
 DESCENT = 0.15
@@ -218,7 +220,7 @@ def push_out(
             break
         distance, normal = solid.normal(points_m[deepest], now)
         top = float(transform(now, solid.corners_m)[:, 2].max())
-        if abs(normal[2]) > STEEP or points_m[deepest, 2] > top - flesh_m:  # it glances off
+        if abs(normal[2]) > STEEP or points_m[deepest, 2] > top - RIM_M:  # it glances off
             pressing[deepest] = True
             continue
         step = _slide(solid, now, points_m[deepest], normal, flesh_m - distance)
