@@ -5,6 +5,7 @@ import json
 import shutil
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
@@ -13,7 +14,6 @@ from egosim_jax.data.shards import ShardReader
 from egosim_jax.interactive.options import Limits
 from egosim_jax.interactive.server import dataset_export, session
 from egosim_jax.interactive.server.store import Store
-from egosim_jax.io.untrusted.parquet import read_parquet
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.types import WAN_GRID, InputError, Motion, ObjectPath
 from tests.painted import VIDEO, PaintedWorld, Painter, painted
@@ -56,7 +56,7 @@ def test_a_lerobot_dataset_has_the_frames_and_actions(folder, tmp_path):
     per_clip = VIDEO.frames - 1
     assert (info["total_episodes"], info["total_frames"]) == (2, len(frames))
     tables = [
-        read_parquet(path, ["action", "observation.images.ego", "index"])
+        pq.read_table(path, columns=["action", "observation.images.ego", "index"]).to_pydict()
         for path in sorted((tmp_path / "set" / "data").rglob("*.parquet"))
     ]
     assert [len(table["index"]) for table in tables] == [2 * per_clip + 1, per_clip + 1]
