@@ -33,8 +33,8 @@ LIBRARIES = ("jax", "jaxlib", "flax")
 VARIABLES = ("XLA_FLAGS", "LIBTPU_INIT_ARGS")
 TRACED = (
     "conditioning", "configs/model.py", "diffusion", "generation/causal.py",
-    "generation/compiled.py", "generation/encoding.py", "generation/generator.py",
-    "generation/stream.py", "models", "sharding.py", "types",
+    "generation/compiled.py", "generation/denoising.py", "generation/encoding.py",
+    "generation/generator.py", "generation/stream.py", "models", "sharding.py", "types",
 )  # fmt: skip
 """Modules that run while a function is traced, and so determine the compiled program."""
 FOLDER, MAX_FILES = "executables", 128

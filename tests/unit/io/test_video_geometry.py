@@ -247,13 +247,18 @@ def test_a_video_that_would_be_misread_is_refused_by_every_opener(written, membe
 
 
 def test_only_one_module_opens_videos():
-    """The others go through `open_video`, so that none has its own idea of geometry and color."""
+    """The others go through `open_video`, so that none has its own idea of geometry and color.
+
+    OpenCV opens cameras alone, by their numbers.
+    """
     package = Path(egosim_jax.__file__).parent
     found = {
         str(path.relative_to(package)): sorted(set(re.findall(r"av\.open|VideoCapture", text)))
         for path in package.rglob("*.py")
         if re.search(r"\bav\.open|VideoCapture", text := path.read_text())
     }
+    assert found.pop("io/shots.py") == ["VideoCapture"]
+    assert (package / "io/shots.py").read_text().count("cv2.VideoCapture(number)") == 1
     assert found == {"io/decoding.py": ["av.open"], "io/writing.py": ["av.open"]}
     assert (package / "io/writing.py").read_text().count('av.open(file, "w"') == 1
 
