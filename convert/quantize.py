@@ -172,13 +172,13 @@ def sources_of(source: Path, folder: Path) -> Mapping[str, tuple[Path, Kind]]:
 
     Raises `InputError` if the source is not a weights folder of ours.
     """
-    found: dict[str, tuple[Path, Kind]] = {}
+    sources: dict[str, tuple[Path, Kind]] = {}
     for name in NETWORKS:
         file = folder / f"{name}.safetensors"
         layers = layers_in_8_bits(read_safetensors(file)) if file.is_file() else {}
         for kind, dtype in DTYPES.items():
             if dtype in layers.values():
-                found[name] = source / file.name, kind
-    if found:
+                sources[name] = source / file.name, kind
+    if sources:
         check_folder(source, "CONFIG")
-    return found
+    return sources

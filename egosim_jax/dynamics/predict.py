@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -72,24 +73,37 @@ class Prediction:
         """Read the hands of an action and the objects of a state. Points without an id rest."""
         tracks = _tracks(action)
         reached = [track.joints_m.reshape(-1, 3) for track in tracks.values()]
-        scene = level_scene(
-            state,
-            action.cameras.world_from_camera[0],
-            np.concatenate([np.zeros((0, 3)), *reached]),
-            reach_m=REACH_M,
-        )
+        points_m = np.concatenate([np.zeros((0, 3)), *reached])
+        camera = action.cameras.world_from_camera[0]
+        return cls.without_hands(state, camera, points_m, fps=fps)._with(tracks)
+
+    @classmethod
+    def without_hands(
+        cls, state: SceneState, world_from_camera: Pose, points_m: Points, *, fps: int
+    ) -> Prediction:
+        """Read the objects of a state within reach of some points; `with_hands` adds hands."""
+        scene = level_scene(state, world_from_camera, points_m, reach_m=REACH_M)
         return cls(
             scene=scene,
-            tracks={hand: _in_level(track, scene) for hand, track in tracks.items()},
+            tracks={},
             held_before=state.held,
-            first=first_solids(scene, state.world_from_object),
+            first=_first_solids(scene, state.world_from_object),
             fps=fps,
         )
 
     def with_hands(self, action: Action) -> Prediction:
         """Return the prediction of another action, whose hands reach no other objects."""
-        tracks = {hand: _in_level(track, self.scene) for hand, track in _tracks(action).items()}
-        return replace(self, tracks=tracks)
+        return self._with(_tracks(action))
+
+    def _with(self, tracks: Mapping[int, HandTrack]) -> Prediction:
+        level = {hand: _in_level(track, self.scene) for hand, track in tracks.items()}
+        return replace(self, tracks=level)
+
+    @cached_property
+    def furniture(self) -> frozenset[int]:
+        """Objects that are parts of one piece of furniture, now or in the first state."""
+        solids = self.scene.solids
+        return frozenset(furniture(solids) | furniture({**solids, **self.first}))
 
     def with_object(self, number: int, points_m: Points) -> Prediction:
         """Return the prediction with one more object, which has no id in the state."""
@@ -113,7 +127,7 @@ class Prediction:
             given={hand: number for hand, (number, _) in given.items()},
             held_before=self.held_before,
             ground_m=self.scene.ground_m,
-            furniture=furniture(solids) | furniture({**solids, **self.first}),
+            furniture=set(self.furniture),
         )
         for frame in range(len(next(iter(self.tracks.values())).present)):
             if frame:
@@ -177,7 +191,7 @@ def _in_level(track: HandTrack, scene: LevelScene) -> HandTrack:
     )
 
 
-def first_solids(scene: LevelScene, poses: Mapping[int, Pose]) -> dict[int, Solid]:
+def _first_solids(scene: LevelScene, poses: Mapping[int, Pose]) -> dict[int, Solid]:
     """Return the objects that have moved as they stood in the first state."""
     level, solids = scene.level_from_world, {}
     for number in poses.keys() & scene.solids.keys():

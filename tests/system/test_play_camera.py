@@ -8,10 +8,8 @@ from egosim_jax.cli.play import Play
 from egosim_jax.perception.video.hands import litert
 from egosim_jax.types import InputError
 
-needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="needs viser")
 
-
-@needs_viser
+@pytest.mark.skipif(find_spec("viser") is None, reason="needs viser")  # an extra
 def test_a_camera_that_is_not_there_ends_the_command_before_anything_is_loaded(monkeypatch):
     monkeypatch.setattr(litert, "fetch_weights", lambda: ())
     monkeypatch.setattr(litert, "HandNetworks", lambda *_, **__: None)

@@ -15,8 +15,6 @@ import numpy as np
 from jaxtyping import Float
 
 from egosim_jax.dynamics import Prediction
-from egosim_jax.dynamics.level import level_scene
-from egosim_jax.dynamics.predict import REACH_M, first_solids
 from egosim_jax.dynamics.solids import Solid
 from egosim_jax.geometry import transform
 from egosim_jax.interactive.env.action_spec import ActionSpec
@@ -59,14 +57,7 @@ class Foresight:
     def of(cls, start: Start, spec: ActionSpec, side: Side, *, fps: int) -> Foresight:
         """Read the objects of a start."""
         camera, corners = start.camera.world_from_camera[0], np.array(spec.workspace_m)
-        level = level_scene(start.state, camera, corners, reach_m=REACH_M)
-        scene = Prediction(
-            scene=level,
-            tracks={},
-            held_before=start.state.held,
-            first=first_solids(level, start.state.world_from_object),
-            fps=fps,
-        )
+        scene = Prediction.without_hands(start.state, camera, corners, fps=fps)
         return cls(scene=scene, start=start, spec=spec, side=side, held=start.state.held.get(0))
 
     def after(self, rows: Float[np.ndarray, "k d"]) -> Foresight:

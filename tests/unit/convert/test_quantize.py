@@ -91,9 +91,9 @@ def test_verify_detects_a_changed_byte_and_another_source(source, tmp_path, caps
     assert verify(source, tmp_path / "out") == 0
     said = capsys.readouterr().out
     assert f"dit: {len(arrays('dit')) + 12} of {len(arrays('dit')) + 12} weights equal" in said
-    other = {name: array * np.float32(1.5) for name, array in arrays("dit").items()}
+    larger = {name: array * np.float32(1.5) for name, array in arrays("dit").items()}
     ours(tmp_path / "other", *NETWORKS[1:])
-    weights.write(tmp_path / "other" / "dit.safetensors", other)
+    weights.write(tmp_path / "other" / "dit.safetensors", larger)
     assert verify(tmp_path / "other", tmp_path / "out") == 1
     said = capsys.readouterr().out
     assert "dit: blocks.self_attn.q.scale differs" in said

@@ -91,8 +91,8 @@ def test_data_that_the_half_grid_can_show_come_out_as_on_the_whole_grid(noise, s
 
 @pytest.mark.parametrize("solver", [UniPC(), DPMSolver()])
 def test_multistep_solvers_start_again_on_the_whole_grid(noise, solver):
-    given = {"process": PROCESS, "solver": solver}
-    exact = integrate(velocity_on_whole, noise, steps=400, **given)
+    sampler = {"process": PROCESS, "solver": solver}
+    exact = integrate(velocity_on_whole, noise, steps=400, **sampler)
     for_steps = [
         float(jnp.linalg.norm(sampled(noise, 0.5, solver, steps=n) - exact)) for n in (10, 20, 40)
     ]
@@ -117,9 +117,9 @@ def test_the_noise_of_the_half_grid_is_standard_and_shared():
     assert (half[:, :, 1:] * half[:, :, :-1]).mean() == pytest.approx(0, abs=0.01)
     # Its own noise gives back the whole noise, any other as much noise.
     np.testing.assert_allclose(refined(jnp.asarray(half), whole, 1.0), whole, atol=1e-6)
-    other = jax.random.normal(jax.random.key(2), half.shape)
+    foreign = jax.random.normal(jax.random.key(2), half.shape)
     (time,) = half_times(np.array([0.6]))
-    for epsilon in (jnp.asarray(half), other):
+    for epsilon in (jnp.asarray(half), foreign):
         x = np.asarray(refined(time * epsilon, whole, 0.6))
         assert x.var() == pytest.approx(0.36, abs=0.004)
         assert (x[:, :, :, 1:] * x[:, :, :, :-1]).mean() == pytest.approx(0, abs=0.004)

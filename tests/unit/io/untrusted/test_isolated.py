@@ -73,8 +73,8 @@ def test_nested_and_packed_numbers_are_read(tmp_path):
     grid = pa.array([[[1.5, 2], [3, 4]]], pa.list_(pa.list_(pa.float32(), 2)))
     name = pa.array(["left"]).dictionary_encode()
     pq.write_table(pa.table({"a": grid, "b": name, "c": pa.nulls(1)}), tmp_path / "a.parquet")
-    found = read_parquet(tmp_path / "a.parquet", ["a", "b", "c"])
-    assert found == {"a": [[[1.5, 2], [3, 4]]], "b": ["left"], "c": [None]}
+    columns = read_parquet(tmp_path / "a.parquet", ["a", "b", "c"])
+    assert columns == {"a": [[[1.5, 2], [3, 4]]], "b": ["left"], "c": [None]}
 
 
 def _pid(path):
