@@ -3,10 +3,14 @@
     python -m tests.benchmarks.bench_gpu parts                       what the device can do
     python -m tests.benchmarks.bench_gpu forward --layers 40 --kernels cudnn
     python -m tests.benchmarks.bench_gpu step --layers 18 --remats full attention
+    python -m tests.benchmarks.bench_gpu forward --weights-8bit float8 --activations-8bit
+    python -m tests.benchmarks.bench_gpu step --recipe egosim_14b_lora --remats full
     python -m tests.benchmarks.bench_gpu clip
+    python -m tests.benchmarks.bench_gpu sample --steps 6            with fewer FLOPs a clip
     python -m tests.benchmarks.bench_gpu stream                      seconds of a student's chunk
     python -m tests.benchmarks.bench_gpu stream --target h200:8      the same, predicted
     python -m tests.benchmarks.bench_gpu stream --config debug --chunks 2 1  a trial on a CPU
+    python -m tests.benchmarks.bench_gpu all --out runs/gpu.jsonl    the main ones, within 9 minutes
 
 All of it at full width and with 24,960 tokens, on random weights. TFLOP/s and MFU count what the
 model needs (`forward_flops` of its config), without recomputation. `--profile` says where the
@@ -20,10 +24,13 @@ import argparse
 import json
 import re
 import statistics
+import subprocess
+import sys
 import tempfile
+import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -36,6 +43,8 @@ from flax import nnx
 from egosim_jax import configs
 from egosim_jax.configs.model import ModelConfig
 from egosim_jax.generation.encoding import batch_shapes
+from egosim_jax.io.weights import flat_shapes
+from egosim_jax.models import eight_bit
 from egosim_jax.models.attention import attention
 from egosim_jax.models.layers import init_sharded
 from egosim_jax.models.wan.dit import WanDiT
@@ -47,6 +56,7 @@ from egosim_jax.train.task import Stage
 from egosim_jax.train.update import Programs
 from egosim_jax.types import MeshConfig
 from tests.benchmarks.gpu import compile_all, draw, draw_generator, half, speed, taken, tera, timed
+from tests.benchmarks.gpu_sampling import sample
 from tests.benchmarks.gpu_stream import stream
 
 BFLOAT16 = 4e-3
@@ -59,7 +69,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("what", choices=["parts", "forward", "step", "clip", "stream"])
+    parser.add_argument("what", choices=[*MEASURES, "all"])
     parser.add_argument("--config", default="egosim_14b")
     parser.add_argument("--layers", type=int, help="fewer blocks than the model has")
     parser.add_argument("--kernels", nargs="+", default=["cudnn"])
@@ -71,14 +81,21 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--profile", action="store_true")
     parser.add_argument("--target", help="only compile, for this: what the preflight predicts")
+    parser.add_argument("--recipe", default="egosim_14b", help="of the step; its model is --config")
+    parser.add_argument("--weights-8bit", choices=["float8"], help="of the forward")
+    parser.add_argument("--activations-8bit", action="store_true")
+    parser.add_argument("--limit-s", type=float, default=530, help="of all")
+    parser.add_argument("--out", type=Path, help="file to which all appends each line")
     options = parser.parse_args()
+    if options.what == "all":
+        run_all(options)
+        return
     if options.target is not None:
         compile_offline()
     else:
         device = jax.devices()[0]
         print(f"{device.device_kind}, jax {jax.__version__}", flush=True)
-    measures = {"parts": parts, "forward": forward, "step": step, "clip": clip, "stream": stream}
-    for line in measures[options.what](options):
+    for line in MEASURES[options.what](options):
         print(json.dumps(line), flush=True)
 
 
@@ -129,7 +146,12 @@ def forward(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """A forward of the transformer, in bfloat16 with bfloat16 weights."""
     for kernel in options.kernels:
         config = _model(options, kernel, "none")
-        graph, params = nnx.split(nnx.eval_shape(lambda c=config: WanDiT(c.dit, rngs=nnx.Rngs(0))))
+        network = nnx.eval_shape(lambda c=config: WanDiT(c.dit, rngs=nnx.Rngs(0)))
+        if options.weights_8bit is not None:
+            layers = eight_bit.layers_of(flat_shapes(network))
+            kinds = dict.fromkeys(layers, eight_bit.DTYPES[options.weights_8bit])
+            eight_bit.adapt(network, kinds, activations=options.activations_8bit)
+        graph, params = nnx.split(network)
         dit = config.dit
         size = (*config.latent_shape, dit.in_channels)
         shapes = (
@@ -148,14 +170,16 @@ def forward(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
         args = (half(params), *shapes)
         with jax.set_mesh(mesh):
             line = {"kernel": kernel, "layers": dit.layers}
+            if options.weights_8bit is not None:
+                line |= {"weights": options.weights_8bit, "activations": options.activations_8bit}
             yield from _measure(options, run, args, needed, line)
 
 
 def step(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """A whole update of full fine-tuning: float32 weights, AdamW, clipping."""
+    """A whole update of a recipe, of all weights or of a LoRA: AdamW, clipping, float32 weights."""
     for kernel in options.kernels:
         for remat in options.remats:
-            stage = _stage(_model(options, kernel, remat), options.clips)
+            stage = _stage(options.recipe, _model(options, kernel, remat), options.clips)
             mesh = make_mesh(stage.training.mesh, _devices(options))
             programs = Programs.of(*stage, mesh)
             batch = stage.task.shapes(options.clips)
@@ -205,6 +229,43 @@ def clip(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 jax.block_until_ready(programs[name](*given))
             yield {"profile of": name}
             yield from kernels
+
+
+def run_all(options: argparse.Namespace) -> None:
+    """Run the cases one after the other, each in a process of its own, until the time is over.
+
+    A case that fails does not stop the others. One that would not end in time is left out.
+    """
+    end = time.monotonic() + options.limit_s
+    common = ["--config", options.config, *(["--target", options.target] if options.target else [])]
+    for words, seconds in CASES:
+        left = end - time.monotonic()
+        command = [sys.executable, "-m", "tests.benchmarks.bench_gpu", *words.split(), *common]
+        if left < seconds:
+            _note(options.out, {"left out": words, "needs_s": seconds, "left_s": round(left)})
+            continue
+        begun = time.monotonic()
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            killer = threading.Timer(left, process.kill)
+            killer.start()
+            for text in process.stdout or ():
+                measured = text.startswith("{")
+                _note(
+                    options.out, {"case": words, **json.loads(text)} if measured else text.strip()
+                )
+            killer.cancel()
+        taken_s = round(time.monotonic() - begun, 1)
+        _note(options.out, {"case": words, "exit": process.returncode, "taken_s": taken_s})
+
+
+def _note(out: Path | None, line: Any) -> None:
+    """Print a line, and append it to a file at once: what was measured survives a kill."""
+    text = line if isinstance(line, str) else json.dumps(line)
+    print(text, flush=True)
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with out.open("a") as file:
+            print(text, file=file)
 
 
 def _measure(
@@ -279,8 +340,8 @@ def _model(options: argparse.Namespace, kernel: Any, remat: Any) -> ModelConfig:
     return replace(config, dit=replace(config.dit, layers=layers, attention=kernel, remat=remat))
 
 
-def _stage(model: ModelConfig, clips: int) -> Stage:
-    task, training = recipes.EGOSIM_14B.stages()["training"]
+def _stage(recipe: str, model: ModelConfig, clips: int) -> Stage:
+    task, training = recipes.RECIPES[recipe][1].stages()["training"]
     training = replace(training, batch_size=clips, grad_accum_steps=1)
     return Stage(replace(task, model=model), training)
 
@@ -335,6 +396,25 @@ def _profile() -> Iterator[list[dict[str, Any]]]:
                     "count": count[name],
                 }
             )
+
+
+MEASURES: Mapping[str, Callable[[argparse.Namespace], Iterator[dict[str, Any]]]] = {
+    "parts": parts,
+    "forward": forward,
+    "step": step,
+    "clip": clip,
+    "stream": stream,
+    "sample": sample,
+}
+CASES = (
+    ("forward --kernels cudnn hopper --repeats 3", 80),
+    ("stream --steps 2 --repeats 2", 120),
+    ("step --recipe egosim_14b_lora --kernels hopper --remats full --repeats 2", 80),
+    ("sample --steps 6", 150),
+    ("forward --kernels hopper --weights-8bit float8 --repeats 3", 45),
+    ("forward --kernels hopper --weights-8bit float8 --activations-8bit --repeats 3", 45),
+)
+"""Cases of `all`, with the seconds that each needs at least; the most wanted first."""
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ import argparse
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -83,6 +84,19 @@ def main() -> None:
         print(f"| {name} | {passes:.1f} | {halves:.1f} | {shown}", flush=True)
 
 
+class Counted:
+    """A denoiser whose forward passes are counted, each by the rows of its latents."""
+
+    def __init__(self, network: Any, rows: list[int]):
+        self.network, self.rows = network, rows
+        self.prepare, self.prepare_half = network.prepare, network.prepare_half
+
+    def denoise(self, noisy: jax.Array, t: jax.Array, context: Any) -> jax.Array:
+        """Denoise, and note the rows when the program does."""
+        jax.debug.callback(lambda _: self.rows.append(noisy.shape[2]), t[0])
+        return self.network.denoise(noisy, t, context)
+
+
 def held_out(model: ModelConfig, clips: int) -> list[Triplet]:
     """Return the conditions of clips of held-out scenes."""
     prior, hands = conditions_of(model)
@@ -113,19 +127,7 @@ def sampled(
     """Return the forward passes of a clip, those on half the grid, the latents and the frames."""
     sampler = egosim.Generator.load(config, weights or configs.shipped_weights(NAME))
     network, rows = sampler.networks.dit, []
-
-    class Counted:
-        """The denoiser, whose forward passes are counted."""
-
-        prepare = staticmethod(network.prepare)
-        prepare_half = staticmethod(network.prepare_half)
-
-        @staticmethod
-        def denoise(x: jax.Array, t: jax.Array, context: object) -> jax.Array:
-            jax.debug.callback(lambda _: rows.append(x.shape[2]), t[0])
-            return network.denoise(x, t, context)
-
-    sample = jax.jit(lambda c, n: denoise(Counted, c, n, config))
+    sample = jax.jit(lambda c, n: denoise(Counted(network, rows), c, n, config))
     latents = []
     for seed, triplet in enumerate(triplets):  # one after the other: each has its own passes
         seeds = np.array([seed], np.uint32)

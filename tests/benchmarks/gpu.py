@@ -33,8 +33,9 @@ def compile_all(
 
 
 def half(params: Any) -> Any:
-    """The same shapes in bfloat16."""
-    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.bfloat16), params)
+    """The same shapes, those of float32 in bfloat16."""
+    dtype = lambda leaf: jnp.bfloat16 if leaf.dtype == jnp.float32 else leaf.dtype  # noqa: E731
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, dtype(leaf)), params)
 
 
 def draw(shapes: Any) -> Any:
@@ -47,12 +48,13 @@ def draw(shapes: Any) -> Any:
     drawn = []
     for seed, (path, leaf) in enumerate(paths):
         name = jax.tree_util.keystr(path)
-        x = _random(seed, leaf.shape, leaf.dtype)
+        float8 = leaf.dtype == jnp.float8_e4m3fn
+        x = _random(seed, leaf.shape, jnp.bfloat16 if float8 else leaf.dtype)
         if "kernel" in name or "embedding" in name or "bias" in name or "modulation" in name:
             x = x * jnp.asarray(0.02, x.dtype)
         elif "scale" in name:
             x = jnp.ones_like(x)
-        drawn.append(x)
+        drawn.append(x.astype(leaf.dtype))
     return jax.tree.unflatten(tree, drawn)
 
 
