@@ -133,11 +133,12 @@ def compile_generation(
     *,
     weights: Kind | None = None,
     computed: float = 1.0,
+    streamed: bool = False,
 ) -> Iterator[tuple[str, Report | OutOfMemory]]:
     """Yield the report of each program of generation, with the weights of all networks resident.
 
     `weights` is the kind of weights in 8 bits; None: all are in the compute dtype. `computed` is
-    the share of the steps that a cache does not reuse.
+    the share of the steps that a cache does not reuse. `streamed`: the programs that decode chunks.
     """
     from flax import nnx
 
@@ -159,7 +160,7 @@ def compile_generation(
             eight_bit.adapt(stored, layers, activations=activations)
     generator = Generator(config, networks, mesh)
     resident = _bytes_per_device(nnx.state(generator.networks))
-    for name, program, given in generator.programs(size):
+    for name, program, given in generator.programs(size, streamed=streamed):
         if name == "noise":  # negligible: it only fills an array of the latents' size
             continue
         traced = program.trace(*given)

@@ -24,10 +24,10 @@ def draw_generator(config: ModelConfig, line: dict[str, Any]) -> Generator:
 
 
 def compile_all(
-    generator: Generator, clips: int, line: dict[str, Any]
+    generator: Generator, clips: int, line: dict[str, Any], *, streamed: bool = False
 ) -> Iterator[tuple[str, Any, tuple]]:
     """Compile and yield the programs of a generator."""
-    for name, program, given in generator.programs(clips):
+    for name, program, given in generator.programs(clips, streamed=streamed):
         timed(line, f"{name}_compile_s", lambda p=program, g=given: p.compile(*g))
         yield name, program, given
 

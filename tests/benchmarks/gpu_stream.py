@@ -48,7 +48,7 @@ def stream(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
         return
     line: dict[str, Any] = {"config": config.name, "chunks": str(chunks), "steps": config.steps}
     generator = draw_generator(config, line)
-    list(compile_all(generator, 1, line))
+    list(compile_all(generator, 1, line, streamed=True))
     yield line
     clip = random_triplet(config.video, 0)
     given = split_triplet(clip, config.chunk_frames)
@@ -133,7 +133,7 @@ def _predicted_stream(config: ModelConfig, options: argparse.Namespace) -> Itera
     target = find(options.target)
     mesh = make_mesh(MeshConfig(data=1, fsdp=1, context=-1), target.devices)
     found: dict[str, Any] = {}
-    for name, report in compile_generation(config, target, mesh, 1):
+    for name, report in compile_generation(config, target, mesh, 1, streamed=True):
         known = isinstance(report, Report)
         needs = report.memory.peak if known else report.needs
         found[name] = report.roofline_s if known else math.nan
