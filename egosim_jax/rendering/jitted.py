@@ -44,6 +44,9 @@ from egosim_jax.rendering.tiles import (
 )
 from egosim_jax.types import Cameras, Kind, Motion, SceneState, View
 
+_FARTHEST = np.uint64(np.float32(np.inf).view(np.uint32)) << np.uint64(32)
+"""Key of a cell that no point is written into, without its number."""
+
 
 def render(
     state: SceneState, cameras: Cameras, *, point_px: int, motion: Motion | None = None
@@ -158,15 +161,15 @@ def _splat(
         nowhere = rows * columns
         at = row.astype(jnp.int32) * columns + column.astype(jnp.int32)  # over 2**24 pixels, too
         cell = jnp.where(seen, at, nowhere)
-        nearest = jnp.full(nowhere + 1, jnp.inf, jnp.float32).at[cell].min(z)
-        first = jnp.where(z <= nearest[cell], cell, nowhere)
-        number = (
-            jnp.full(nowhere + 1, count, jnp.int32)
-            .at[first]
-            .min(jnp.arange(count, dtype=jnp.int32))
-        )
+        # Positive floats are in the order of their bits: the least key is the nearest point, at
+        # equal depth the first. One scatter of 64 bits takes half the time of two of 32.
+        bits = jax.lax.bitcast_convert_type(z, jnp.uint32).astype(jnp.uint64)
+        key = (bits << 32) | jnp.arange(count, dtype=jnp.uint64)
+        least = jnp.full(nowhere + 1, _FARTHEST | np.uint64(count)).at[cell].min(key)[:-1]
+        nearest = jax.lax.bitcast_convert_type((least >> 32).astype(jnp.uint32), jnp.float32)
+        number = least.astype(jnp.uint32).astype(jnp.int32)
         return _nearest_square(
-            nearest[:-1].reshape(rows, columns), number[:-1].reshape(rows, columns), point_px
+            nearest.reshape(rows, columns), number.reshape(rows, columns), point_px
         )
 
     depth, number = jax.lax.map(frame, cameras_from_world)
