@@ -41,9 +41,9 @@ DEEP_M = 0.012
 The visible side of a ball is smaller than the ball."""
 DENT_M = 0.018
 """Maximum depth of a fingertip in a hull, in meters; a fist that enters an object grips nothing."""
-UNEVEN_M = 0.025
+UNEVEN_M = 0.018
 """Maximum difference between the distances of both fingertips from a hull, in meters."""
-INSIDE_M = 0.002
+INSIDE_M = 0.001
 """Maximum distance of the pinch point from a hull, in meters."""
 SAME_WAY = 0.7
 """Minimum cosine between two steps of a hand that belong to one motion."""
@@ -213,8 +213,10 @@ def contact_of(solid: Solid, pose: Pose, track: HandTrack, hold: Hold) -> Contac
         ]
         dented = max(depths) > min(DENT_M, UNEVEN_M - max(gaps)) + slack
         pad = PAD_M + min(max(-float(middle), 0.0), DEEP_M) / 2
-        if max(gaps) <= pad + slack and middle <= INSIDE_M + slack / 2 and not dented:
-            return Contact(pinch_m=point, depth_m=-float(middle), gap_m=float(np.mean(gaps)))
+        gap = float(np.mean(gaps))
+        beside = gap > PAD_M + slack or middle > INSIDE_M + slack / 2
+        if max(gaps) <= pad + slack and not (beside or dented):
+            return Contact(pinch_m=point, depth_m=-float(middle), gap_m=gap)
     return None
 
 

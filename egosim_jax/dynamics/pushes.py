@@ -6,8 +6,8 @@ with c the radius of gyration of the pressure (Goyal, Ruina and Papadopoulos 199
 was pushed pushes the next one.
 
 Not every part of a hand that is inside an object pushes it: fingers come from above, close around
-an object, or open in it. A point of the hand that once did not push an object only presses on it
-until it leaves it.
+an object, or open or rise in it. A point of the hand that once did not push an object only presses
+on it until it leaves it.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ RIM_M = 0.003
 """Depth below the top of an object up to which a point glances off it, in meters."""
 STEEP = 0.7
 """Vertical component of a normal above which a point presses on an object."""
-DESCENT = 0.15
-"""Descent per horizontal motion from which an open hand comes down on an object."""
+STEEPNESS = 0.15
+"""Vertical per horizontal motion from which an open hand comes down on an object, or leaves it."""
 FACING = 0.4
 """Component of a normal along the opening of a hand from which a side of an object faces a tip."""
 RESTS_M = 0.001
@@ -185,7 +185,7 @@ def _yields(
     """Return which points of a hand yield to an object, because the hand reaches around it.
 
     The object must fit in the hand. Fingers that close on it yield while it is between thumb and
-    fingers. All points yield that come down on it. A noisy hand may close unseen.
+    fingers. All points yield that come down on it or rise from it. A noisy hand may close unseen.
     """
     track, solid, pose = walk.tracks[hand], walk.solids[number], walk.poses[number]
     thumb, fingers = track.tips_m[walk.frame]
@@ -194,12 +194,12 @@ def _yields(
     level = opening * [1, 1, 0] / max(float(np.hypot(*opening[:2])), 1e-9)
     if size < solid.width_along(level, pose) - FITS_M:
         return np.zeros(len(way_m), bool)
-    falls = -way_m[:, 2] > DESCENT * np.linalg.norm(way_m[:, :2], axis=1)
+    vertical = np.abs(way_m[:, 2]) > STEEPNESS * np.linalg.norm(way_m[:, :2], axis=1)
     first, second = (solid.normal(tip, pose)[1] @ opening / size for tip in (thumb, fingers))
     around = first < -FACING and second > FACING
     change_m = float(np.diff(track.opening_m[walk.frame - 1 : walk.frame + 1])[0])
     closes = track.sigma_m > 0 or change_m < -CLOSES_M
-    return falls | _fingers(track.kind) if around and closes else falls
+    return vertical | _fingers(track.kind) if around and closes else vertical
 
 
 def push_out(
