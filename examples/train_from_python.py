@@ -10,9 +10,8 @@ from egosim_jax.worlds.tabletop import make_sequence, to_triplet
 out = Path("runs/examples/train_from_python")
 about, recipe = RECIPES["debug"]
 print(about)
-short = replace(
-    recipe, out=out, vae=replace(recipe.vae, steps=10), denoiser=replace(recipe.denoiser, steps=10)
-)
+vae, denoiser = (replace(stage, steps=4) for stage in (recipe.vae, recipe.denoiser))
+short = replace(recipe, out=out, clips=4, clip_frames=9, vae=vae, denoiser=denoiser)
 short.run()  # the same call resumes an interrupted training
 
 generator = egosim.Generator.load("debug", out / "weights")

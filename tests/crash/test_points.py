@@ -1,4 +1,4 @@
-"""A few of the points at which every writer is killed; `python -m tests.crash` tries all."""
+"""One of the points at which every writer is killed; `python -m tests.crash` tries all."""
 
 import subprocess
 import sys
@@ -20,7 +20,7 @@ WRITERS = (
 
 
 def test_nothing_is_lost_wherever_a_writer_is_killed(tmp_path):
-    few = ["--most", "2", "--seed", "1", "--folder", str(tmp_path)]
+    few = ["--most", "1", "--seed", "1", "--folder", str(tmp_path)]
     ran = subprocess.run(
         [sys.executable, "-m", "tests.crash", *few, "--writer", *WRITERS.split()],
         cwd=ROOT,
@@ -28,7 +28,7 @@ def test_nothing_is_lost_wherever_a_writer_is_killed(tmp_path):
         text=True,
     )
     assert ran.returncode == 0, ran.stdout + ran.stderr
-    assert ran.stdout.splitlines()[-1] == f"{2 * len(WRITERS.split())} points in all"
+    assert ran.stdout.splitlines()[-1] == f"{len(WRITERS.split())} points in all"
 
 
 def test_calls_from_c_are_seen_in_order_and_not_made_once_it_is_killed(tmp_path):

@@ -35,6 +35,7 @@ def run(monkeypatch, tmp_path):
     return command
 
 
+@pytest.mark.usefixtures("without_lpips")
 def test_it_trains_compares_and_repeats_no_work(run):
     out, report = run()
     rows = {

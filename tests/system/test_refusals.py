@@ -174,7 +174,7 @@ def test_an_interrupt_is_one_line(name, made, tmp_path):
     program, *arguments = COMMANDS[name].format(made=made, out=tmp_path / "out").split()
     module = {"egosim": "cli", "egosim-convert": "convert"}[program]
     chance = random.Random(name)
-    for _ in range(3):
+    for _ in range(2):
         process = subprocess.Popen(
             [sys.executable, "-m", f"egosim_jax.{module}", *arguments],
             stderr=subprocess.PIPE,

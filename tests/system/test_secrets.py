@@ -3,10 +3,12 @@
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
+from pathlib import Path
 
 import pytest
 
-from tests.system.test_sockets import LOOPBACK, seen_while
+from tests.system.test_sockets import seen_while
 
 SECRETS = {
     "WANDB_API_KEY": "5ecre7-wandb",
@@ -15,27 +17,31 @@ SECRETS = {
     "HTTPS_PROXY": "http://user:5ecre7-proxy@localhost:9",
 }
 COMMANDS = {
-    "train": ["egosim_jax.train", "debug", "--clips", "4", "--vae.steps", "1",
-              "--denoiser.steps", "1"],
     "generate": ["egosim_jax.cli", "generate", "--config", "debug"],
     "simulate": ["egosim_jax.cli", "simulate", "--clips", "1"],
-}  # fmt: skip
+}
+"""`tests/training/test_from_scratch.py` has a training."""
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_reveals_no_secret_and_listens_nowhere(name, tmp_path):
-    said = tmp_path / "said"
+def reveals_nothing(command: Sequence[str], out: Path, **environment: str) -> set[str]:
+    """Run a command that writes to OUT; return where it listened."""
+    said = out.with_name("said")
     with said.open("wb") as log:
         process = subprocess.Popen(
-            [sys.executable, "-m", *COMMANDS[name], "--out", str(tmp_path / "run")],
-            env={**os.environ, **SECRETS},
+            [sys.executable, "-m", *command, "--out", str(out)],
+            env={**os.environ, **SECRETS, **environment},
             stdout=log,
             stderr=log,
         )
         found = seen_while([process])
-    assert found <= (LOOPBACK if name == "train" else set())
-    files = [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
+    files = [path for path in out.rglob("*") if path.is_file()]
     assert any(path.name == "environment.json" for path in files)
     written = [said.read_bytes(), *(path.read_bytes() for path in files)]
     for secret in SECRETS.values():
         assert not any(secret.encode() in data for data in written)
+    return found
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_reveals_no_secret_and_listens_nowhere(name, tmp_path):
+    assert reveals_nothing(COMMANDS[name], tmp_path / "run") == set()

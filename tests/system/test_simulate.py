@@ -106,7 +106,7 @@ def test_the_experiment_compares_worlds_that_remember_with_one_that_does_not(
 ):
     out = tmp_path / "out"
     fixed = ["--config", "debug", "--weights", str(weights), "--out", str(out)]
-    command = ["experiment", "continuous", *fixed, "--sequences", "2", "--clips", "2"]
+    command = ["experiment", "continuous", *fixed, "--sequences", "1", "--clips", "2"]
     assert main(command) == 0
     report = json.loads((out / "report.json").read_text("utf-8"))
     tables = report["tables"]

@@ -1,6 +1,7 @@
 """The experiments on the true tabletop world, in their smallest size; a rerun computes nothing."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -8,8 +9,6 @@ from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
 from egosim_jax.io.weights import STUDENT
 from egosim_jax.worlds.tabletop.policies import POLICIES
-
-pytestmark = pytest.mark.slow
 
 
 def test_looking_away_reports_each_case_and_method_and_resumes(weights, tmp_path, capsys):
@@ -53,8 +52,16 @@ def test_policies_are_ranked_and_the_ranking_resumes(weights, tmp_path, capsys):
     assert (out / "report.json").read_bytes() == kept
 
 
-def test_a_student_is_compared_with_its_teacher_and_the_loop_resumes(tmp_path, capsys):
-    """A stage whose file is the student's own is the student."""
+@pytest.mark.usefixtures("without_lpips")
+def test_a_student_is_compared_with_its_teacher_and_the_loop_resumes(tmp_path, capsys, monkeypatch):
+    """A stage whose file is the student's own is the student. Small images are generated sooner."""
+    shipped = configs.get
+
+    def small(name):
+        config = shipped(name)
+        return replace(config, video=replace(config.video, height=48, width=80))
+
+    monkeypatch.setattr(configs, "get", small)
     out, file = tmp_path / "out", configs.weights_of("tabletop_student", None) / STUDENT
     command = ["experiment", "students", "--out", str(out), "--stages", f"own={file}"]
     command += ["--scenes", "2", "--batch-size", "2", "--teacher-steps", "2"]

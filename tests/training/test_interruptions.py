@@ -13,7 +13,7 @@ import pytest
 from egosim_jax.data.loader import make_loader
 from egosim_jax.data.shards import ShardReader
 from egosim_jax.runtime.command import ExitCode
-from tests.training.killing import logged, start_line, start_pair
+from tests.training.killing import logged, start_line
 from tests.training.line import write_points
 
 pytestmark = pytest.mark.slow
@@ -125,35 +125,6 @@ def test_a_run_resumes_on_other_numbers_of_devices(points, straight, tmp_path):
     assert [line["ids"] for line in moved] == [line["ids"] for line in alone]
     losses = [[line["loss"] for line in log] for log in (moved, alone)]
     np.testing.assert_allclose(*losses, rtol=1e-5)
-
-
-def finish(processes: list[subprocess.Popen]) -> list[int]:
-    said = [process.communicate(timeout=300)[1] for process in processes]
-    codes = [process.returncode for process in processes]
-    assert set(codes) <= {ExitCode.DONE, ExitCode.RESUBMIT}, said
-    return codes
-
-
-def test_two_processes_stop_together_and_resume_bit_for_bit(points, tmp_path):
-    both = [(points, LONG | {"pause": 0.06})] * 2
-    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-    assert finish(start_pair(whole, *both)) == [ExitCode.DONE, ExitCode.DONE]
-    for step, receiver in ((9, 1), (16, 0)):  # after a save, and after a resume and a save
-        processes = start_pair(stopped, *both)
-        wait_for(stopped, step, *processes)
-        processes[receiver].send_signal(signal.SIGTERM)
-        before = updates(stopped)
-        assert finish(processes) == [ExitCode.RESUBMIT, ExitCode.RESUBMIT]
-        assert before <= updates(stopped) <= before + 2  # the signal is passed on first
-    processes = start_pair(stopped, *both)
-    wait_for(stopped, updates(stopped) + 9, *processes)
-    for process in processes:
-        process.kill()
-        process.communicate()
-    assert finish(start_pair(stopped, *both)) == [ExitCode.DONE, ExitCode.DONE]
-    assert logged(stopped) == logged(whole)
-    steps = [line["step"] for line in logged(whole) if "loss" in line]
-    assert steps == list(range(1, STEPS + 1))
 
 
 def test_sigterm_ends_the_making_of_clips_with_75(tmp_path):
