@@ -52,7 +52,7 @@ class Render:
     An episode with ground truth (`egosim episode make`), a clip of `egosim data annotate`, a run of
     `egosim simulate`, or a session of `egosim serve` or `egosim play`."""
     robot: str
-    """Name in `egosim robot list`."""
+    """Name in `egosim robot list`, or the .toml file of your own robot (docs/robot.md)."""
     out: Path
     """Folder to write, new or empty."""
     hands: Literal["acting", "all"] = "acting"
@@ -71,7 +71,6 @@ class Render:
         from egosim_jax.io.run import write_json
         from egosim_jax.io.writing import write_video
         from egosim_jax.rendering import get
-        from egosim_jax.robots.arms import arm_of
         from egosim_jax.robots.conversion import (
             convert,
             export,
@@ -79,12 +78,12 @@ class Render:
             triplets_of,
             video_of,
         )
-        from egosim_jax.robots.models import load_model
+        from egosim_jax.robots.own import open_robot
         from egosim_jax.robots.sources import open_source
 
-        arm = arm_of(self.robot)
         check_new(self.out)
-        robot = load_model(arm)
+        robot = open_robot(self.robot)
+        arm = robot.arm
         began = time.monotonic()
         source = open_source(self.source)
         episode = source.episode
@@ -129,11 +128,33 @@ def _words(entry: Mapping[str, Any]) -> str:
     return words
 
 
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """Check the description of your own robot: its URDF or MJCF, its gripper and its units.
+
+    Prints the parts of the model that the description names, or the first problem and its fix.
+    Nothing is written.
+    """
+
+    robot: Annotated[Path, tyro.conf.Positional]
+    """Description, a .toml file (docs/robot.md)."""
+
+    def run(self) -> int:
+        """Print the arm, its gripper, and the frames that the description gives."""
+        from egosim_jax.robots.own import load_own
+        from egosim_jax.robots.own_report import lines_of
+
+        for line in lines_of(load_own(self.robot)):
+            print_line(line)
+        return ExitCode.DONE
+
+
 Robot = group(
     "Robot",
     "Turn clips with hands into clips of robots, with their joint positions.",
     {
         "render": Render,
         "list": List,
+        "check": Check,
     },
 )
