@@ -22,7 +22,7 @@ from egosim_jax.robots.background import Background, first_cloud, remove_hands
 from egosim_jax.robots.drawing import Drawn, Shape, draw
 from egosim_jax.robots.models import RobotModel, limits_of
 from egosim_jax.robots.placement import Base, Placed, place
-from egosim_jax.robots.retarget import Grips, continuous, grips_of
+from egosim_jax.robots.retarget import Grips, continuous, grips_of, keypoints_of
 from egosim_jax.robots.sources import Source
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.simulation.start import Start
@@ -31,8 +31,6 @@ from egosim_jax.types import Action, InputError, SceneState, Triplet, seen_hands
 
 Hands = Literal["acting", "all"]
 """Hands that get a robot: the one that moves most, or every one; all hands are removed."""
-WRIST_M = 0.12
-"""Distance of a gripper's wrist from its tips in exported skeletons."""
 AROUND_M = 0.25
 """Horizontal distance from the hand's path in which the table is searched."""
 BIN_M = 0.01
@@ -336,11 +334,7 @@ def _skeletons(conversion: Conversion, clip: int, action: Action) -> Action:
     for follower in conversion.followers:
         track = follower.placed.track
         pose = follower.placed.world_from_base @ track.base_from_grip[span]
-        place, across, along = pose[:, :3, 3], pose[:, :3, 0], pose[:, :3, 2]
-        half = track.opening_m[span, None] / 2
-        hands.append(
-            np.stack([place - WRIST_M * along, place - half * across, place + half * across], 1)
-        )
+        hands.append(keypoints_of(pose, track.opening_m[span]))
     joints = np.stack(hands, axis=1)
     return Action(
         cameras=action.cameras,

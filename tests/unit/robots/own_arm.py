@@ -22,13 +22,6 @@ closing_sign = -1
 largest_opening_m = 0.08
 tips = [{frame = "left", offset_m = [0.0, 0.0, 0.05]}, {frame = "right_tip"}]
 """
-CAMERA = """
-[camera]
-base_from_camera = [[0, 0, -1, 1.3], [1, 0, 0, 0], [0, -1, 0, 0.45], [0, 0, 0, 1]]
-intrinsics_px = [[60, 0, 47.5], [0, 60, 31.5], [0, 0, 1]]
-width = 96
-height = 64
-"""
 RECORDING = """
 [recording]
 angle_unit = "degrees"
