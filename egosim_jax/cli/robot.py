@@ -175,7 +175,7 @@ class Actions:
     episode: int = 0
     """Number of the episode in the dataset."""
     joints: Literal["observation.state", "action"] = "observation.state"
-    """Joints to follow: the measured ones, or the commands, each of which is for the next frame."""
+    """Joints to follow: the measured ones, or the commands, each for the next frame."""
     depth: str | None = None
     """Depth of the first frame: an .npz file with depth_m in meters, or NETWORK=FOLDER.
 

@@ -47,7 +47,7 @@ def check_closing(described: Description, opened: np.ndarray, closed: np.ndarray
         )
     if wide < narrow:
         raise InputError(
-            f"{name}: the gripper opens by {1000 * (narrow - wide):.1f} mm when it is told to "
+            f"{name}: the gripper opens by {1000 * (narrow - wide):.1f} mm when it should "
             f"close, by {quote(driver)}: closing_sign must be {-sign}. (gripper.closing_sign)"
         )
 
@@ -57,12 +57,14 @@ def check_gripper(described: Description, robot: RobotModel) -> None:
     name, gripper = quote_path(described.path), described.gripper
     driver, openings = gripper.joints[0], robot.openings_m
     ends = robot.arm.gripper
-    path = np.diff(robot.positions[:, _column(robot, driver)])
+    driven = robot.positions[:, _column(robot, driver)]
+    path = np.diff(driven)
     if openings[0] < -MIN_OPENING_M or path.min() < 0 < path.max():
         raise InputError(
             f"{name}: the tips pass each other or turn back while {quote(driver)} goes from "
-            f"{ends.open:g} to {ends.closed:g}: they must close at its end. Correct the tips' "
-            "offsets, or the joint's limits. (gripper.tips)"
+            f"{ends.open:g} to {ends.closed:g}; they are nearest at {driven[0]:.4g} and farthest "
+            f"apart at {driven[-1]:.4g}, across the fingers. Correct the tips' offsets, or give "
+            "the positions of both ends. (gripper.tips, gripper.closed_at, gripper.open_at)"
         )
     moved = np.ptp(robot.positions, axis=0)
     still = [j for j in gripper.joints[1:] if moved[_column(robot, j)] < FOLLOWS]
@@ -72,11 +74,11 @@ def check_gripper(described: Description, robot: RobotModel) -> None:
             f"{quote(driver)}: add <mimic> to it in the URDF, or an <equality> of both joints to "
             "the MJCF. (gripper.joints)"
         )
-    measured, told = robot.largest_m, gripper.largest_opening_m
-    if abs(measured - told) > max(OPENING_TOLERANCE * told, OPENING_TOLERANCE_M):
+    measured, said = robot.largest_m, gripper.largest_opening_m
+    if abs(measured - said) > max(OPENING_TOLERANCE * said, OPENING_TOLERANCE_M):
         raise InputError(
             f"{name}: the tips of the model open by {1000 * measured:.4g} mm, and "
-            f"largest_opening_m is {told:g}, {1000 * told:.4g} mm: they may differ by "
+            f"largest_opening_m is {said:g}, {1000 * said:.4g} mm: they may differ by "
             f"{OPENING_TOLERANCE:.0%}. Correct the tips, the limits of {quote(driver)}, or "
             "the number. (gripper.largest_opening_m)"
         )

@@ -62,6 +62,10 @@ class OwnGripper:
     """Largest distance between the fingers, to be compared with the model's."""
     tips: tuple[Tip, Tip]
     """Tip of each finger."""
+    closed_at: float | None = None
+    """Position of the driving joint at which the fingers touch; None: the end of its limits."""
+    open_at: float | None = None
+    """Position at which they are farthest apart; None: the other end."""
     speed_m_s: float = GRIPPER_SPEED_M_S
     """Maximum speed of the opening."""
     body: str | None = None
@@ -197,6 +201,8 @@ def _gripper(table: Table) -> OwnGripper:
         closing_sign=int(sign),
         largest_opening_m=table.number("largest_opening_m", low=0.0),
         tips=(tips[0], tips[1]),
+        closed_at=table.number("closed_at") if "closed_at" in table.values else None,
+        open_at=table.number("open_at") if "open_at" in table.values else None,
         speed_m_s=table.number("speed_m_s", GRIPPER_SPEED_M_S, low=0.0),
         body=table.text("body", "") or None,
         approach=_point([value / length for value in approach]) if approach else None,

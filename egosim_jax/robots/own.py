@@ -1,8 +1,8 @@
-"""Robots of one's own: loading and checking the model of a description (`description.py`).
+"""Described robots: loading and checking the model of a description (`description.py`).
 
 A check compares what the description says with what the model does: every joint has a role and
-limits, the gripper closes when it is told to and opens as wide as it is said to, its joints follow
-the one that drives, nothing else follows the arm, and sizes are of a robot in meters.
+limits, the gripper closes in the described direction and opens as wide as described, its joints
+follow the one that drives, nothing else follows the arm, and sizes are of a robot in meters.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ class OwnModel:
     """Description of the robot."""
     robot: RobotModel
     """Its model."""
-    notes: tuple[str, ...] = ()
-    """Replaced parts of the model, for the user."""
+    replaced: tuple[str, ...] = ()
+    """Links that are drawn by their collision geometry, because MuJoCo cannot read the visual."""
 
 
 def open_robot(name: str) -> RobotModel:
@@ -138,7 +138,7 @@ def _checked(described: Description, urdf: Urdf) -> OwnModel:
     robot = with_reach(described, robot)
     check_sizes(described, robot)
     check_equalities(described, robot)
-    return OwnModel(description=described, robot=robot, notes=tuple(urdf.notes))
+    return OwnModel(description=described, robot=robot, replaced=tuple(urdf.replaced))
 
 
 def _check_names(described: Description, spec: Any) -> None:
@@ -297,6 +297,22 @@ def _arm(described: Description, urdf: Urdf, mj: Any) -> Arm:
     gripper, palm = described.gripper, _palm(described, mj)
     low, high = mj.joint(gripper.joints[0]).range.tolist()
     opened, closed = (low, high) if gripper.closing_sign > 0 else (high, low)
+    for key in ("open_at", "closed_at"):
+        value = getattr(gripper, key)
+        if value is not None and not low <= value <= high:
+            raise InputError(
+                f"{quote_path(described.path)}: {key} is {value:g}, and the limits of "
+                f"{quote(gripper.joints[0])} are {_interval((low, high))}: it must be inside, in "
+                f"radians or meters. (gripper.{key})"
+            )
+    opened = opened if gripper.open_at is None else gripper.open_at
+    closed = closed if gripper.closed_at is None else gripper.closed_at
+    if (closed - opened) * gripper.closing_sign <= 0:
+        raise InputError(
+            f"{quote_path(described.path)}: the gripper closes from {opened:g} to {closed:g}, and "
+            f"closing_sign is {gripper.closing_sign}: correct one of them. (gripper.open_at, "
+            "gripper.closed_at)"
+        )
     points = [_tip(mj, tip.frame, tip.offset_m) for tip in gripper.tips]
     tips = {}
     for value in (opened, closed):

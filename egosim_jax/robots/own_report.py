@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from egosim_jax.io.bounded import quote_path
+from egosim_jax.io.bounded import listing, quote_path
 from egosim_jax.robots.checks import WORKING
 from egosim_jax.robots.ik import posed
 from egosim_jax.robots.models import RobotModel, is_slide, limits_of, tip_point
@@ -28,7 +28,8 @@ def _lines(own: OwnModel) -> Iterator[str]:
     count = len(arm.joints)
     yield f"base {described.base}, {count} joints, up to {arm.reach_m / WORKING:.2f} m to the grip"
     for name, home, speed in zip(arm.joints, arm.home, arm.speeds, strict=True):
-        yield f"  {name}: {_kind(mj, name)}, {_limits(mj, name)}, home {home:.3g}, {speed:.3g}/s"
+        rest = f"home {round(home, 3) + 0.0:g}, {speed:.3g}/s"
+        yield f"  {name}: {_kind(mj, name)}, {_limits(mj, name)}, {rest}"
     for name, value in described.fixed.items():
         yield f"  {name}: {_kind(mj, name)} that rests at {value:g}"
     yield (
@@ -51,7 +52,11 @@ def _lines(own: OwnModel) -> Iterator[str]:
     )
     meshes = f", {mj.nmesh} meshes" if mj.nmesh else ""
     yield f"{mj.ngeom - 1} geometries{meshes}, {mj.neq} equalities"
-    yield from own.notes
+    if own.replaced:
+        yield (
+            f"drawn by their collision geometry, because MuJoCo does not read their visual meshes: "
+            f"{listing(list(own.replaced))}"
+        )
     if described.camera is not None:
         place = described.camera.base_from_camera[:3, 3]
         at = ", ".join(f"{value:.3f}" for value in place)

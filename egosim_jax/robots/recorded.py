@@ -1,4 +1,4 @@
-"""Recorded joints of a robot of one's own: LeRobot datasets as actions of its gripper.
+"""Recorded joints of a described robot: LeRobot datasets as actions of its gripper.
 
 The world of such an episode is the frame of the robot's base. Joint positions give the pose of the
 gripper by the model, and the recorded gripper its opening, so each frame has three keypoints. The
@@ -47,15 +47,15 @@ from egosim_jax.types import (
 Column = Literal["observation.state", "action"]
 """Joints to follow: the measured or the commanded ones."""
 BEYOND, BEYOND_M = np.radians(3.0), 0.005
-"""Distance by which a recorded position may be beyond a limit, in radians or meters."""
+"""Largest distance of a recorded position beyond a limit, in radians or meters."""
 BEYOND_SHARE = 0.1
-"""Share of its range by which the recorded gripper may be beyond its ends."""
+"""Largest distance of the recorded gripper beyond its ends, as a share of its range."""
 MIN_DEGREES = 2 * np.pi
 """Least largest angle in degrees: smaller ones are radians."""
 MAX_TURN = 4 * np.pi
 """Largest angle of an endless joint, in radians."""
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Axes of OpenGL in those of OpenCV."""
+"""Axes of OpenGL in OpenCV's axes."""
 
 
 @no_type_check

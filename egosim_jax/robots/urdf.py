@@ -54,14 +54,14 @@ class Urdf:
     """Maximum speed of each joint that has one."""
     continuous: set[str] = field(default_factory=set)
     """Joints that turn without end."""
-    notes: list[str] = field(default_factory=list)
-    """Replaced parts, for the user."""
+    replaced: list[str] = field(default_factory=list)
+    """Links that are drawn by their collision geometry, because MuJoCo cannot read the visual."""
 
 
 def read_urdf(path: Path, root: Element, packages: Mapping[str, Path], folder: Path) -> Urdf:
     """Return the specification of a URDF, whose meshes are in `folder`, its own or a package's.
 
-    Raises `InputError` for a tree that is none, a joint that no arm has, and missing meshes.
+    Raises `InputError` for links that are not a tree, a joint that no arm has, and missing meshes.
     """
     mujoco: Any = import_module("mujoco")
 
@@ -261,7 +261,7 @@ def _add_geometries(
     colors: Mapping[str, list[float]],
     name: str,
 ) -> None:
-    """Add what is seen of a link and what collides; each stands in for the other if it is absent.
+    """Add the visual and the collision geometry of a link; each replaces the other if it is absent.
 
     Missing files are noted in `files`.
     """
@@ -292,8 +292,7 @@ def _add_geometries(
             f"that could replace it: MuJoCo reads {', '.join(MESHES)}. Convert it."
         )
     if replaced:
-        text = f"{quote_text(link.attributes['name'])} is drawn by its collision geometry"
-        urdf.notes.append(f"{text}: MuJoCo does not read {quote_text(replaced[0])}")
+        urdf.replaced.append(quote_text(link.attributes["name"]))
         seen = []
     for shape in seen or solid:
         _add_geometry(urdf.spec, body, shape, seen=True, solid=not solid or not seen)
@@ -302,7 +301,7 @@ def _add_geometries(
 
 
 def _shape(element: Element, files: _Files, where: str) -> dict[str, Any] | None:
-    """Return type, size and place of a geometry for MuJoCo; None if there is none."""
+    """Return type, size and place of a geometry for MuJoCo; None without one."""
     mujoco: Any = import_module("mujoco")
 
     geometry, types = element.find("geometry"), mujoco.mjtGeom
@@ -341,11 +340,12 @@ def _add_geometry(spec: Any, body: Any, shape: dict[str, Any], *, seen: bool, so
 
     shape = {"rgba": GRAY, **shape}
     if "file" in shape:
-        mesh = spec.add_mesh(
-            name=f"mesh {len(spec.meshes)}", file=str(real_path(shape.pop("file"))),
-            scale=shape.pop("scale"), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
-        )  # fmt: skip
-        shape["meshname"] = mesh.name
+        file, scale = str(real_path(shape.pop("file"))), shape.pop("scale")
+        name = f"{file} {scale}"
+        if spec.mesh(name) is None:  # motors and mirrored links share their meshes
+            inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+            spec.add_mesh(name=name, file=file, scale=scale, inertia=inertia)
+        shape["meshname"] = name
     group = SEEN if seen else SOLID
     body.add_geom(**shape, group=group, contype=int(solid), conaffinity=int(solid))
 

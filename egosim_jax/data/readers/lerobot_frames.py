@@ -17,6 +17,8 @@ from egosim_jax.io.images import decode_image
 from egosim_jax.io.untrusted.parquet import read_image_rows
 from egosim_jax.types import InputError
 
+GROUP = 128
+"""Number of images of a table that are read at once."""
 Each = Callable[[np.ndarray], np.ndarray]
 
 
@@ -61,8 +63,12 @@ def frames_of(
     name = f"{quote_path(path)}, frame 0"
 
     def read(count: int, each: Each) -> np.ndarray:
-        encoded = read_image_rows(path, chosen[0], episode, range(count))
-        return np.stack([each(decode_image(data, name=quote_path(path))) for data in encoded])
+        images = []
+        for start in range(0, count, GROUP):
+            frames = range(start, min(start + GROUP, count))
+            encoded = read_image_rows(path, chosen[0], episode, frames)
+            images += [each(decode_image(data, name=quote_path(path))) for data in encoded]
+        return np.stack(images)
 
     (first,) = read_image_rows(path, chosen[0], episode, [0])
     return EpisodeFrames(

@@ -16,8 +16,8 @@ MAX_COLUMN_BYTES = 1 << 26
 """Largest size of the columns that are read, in bytes, unpacked."""
 MAX_VALUES = 1 << 23
 """Maximum number of values of the columns that are read, each 32 bytes or more in Python."""
-MAX_IMAGES_BYTES, MAX_IMAGES_MEMORY = 1 << 28, 3 << 29
-"""Maximum size of the images that one call returns, and memory of the child for it, in bytes."""
+MAX_IMAGES_BYTES = 1 << 27
+"""Maximum size of the encoded images that one call returns, in bytes."""
 
 
 def read_parquet(
@@ -41,9 +41,7 @@ def read_image_rows(path: Path, column: str, episode: int, frames: Sequence[int]
     Raises `InputError` as `read_parquet` does, if a frame is missing or has no bytes, and for more
     than `MAX_IMAGES_BYTES`.
     """
-    return read_file(
-        _read_images, path, column, episode, list(frames), max_memory=MAX_IMAGES_MEMORY
-    )
+    return read_file(_read_images, path, column, episode, list(frames))
 
 
 def _read_images(path: Path, column: str, episode: int, frames: list[int]) -> list[bytes]:
@@ -72,8 +70,8 @@ def _read_images(path: Path, column: str, episode: int, frames: list[int]) -> li
                         size += len(data)
                         if size > MAX_IMAGES_BYTES:
                             raise InputError(
-                                f"{name} has more than {MAX_IMAGES_BYTES:,} bytes of images in "
-                                "these frames: choose fewer clips. (--clips)"
+                                f"{name} has more than {MAX_IMAGES_BYTES:,} bytes in "
+                                f"{len(frames)} images: store smaller images, or a video."
                             )
                         found[frame] = data
         except (pa.ArrowException, OSError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""A robot of one's own: a URDF of 7 joints with a mimic gripper, its mesh and its description."""
+"""An own robot: a URDF of 7 joints with a mimic gripper, its mesh and its description."""
 
 import struct
 from dataclasses import dataclass, field

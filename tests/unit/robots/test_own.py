@@ -1,4 +1,4 @@
-"""A robot of one's own is read as its URDF or MJCF says, or refused before any work."""
+"""An own robot is read as its URDF or MJCF says, or refused before any work."""
 
 import mujoco
 import numpy as np
@@ -156,7 +156,7 @@ def test_a_mesh_that_mujoco_does_not_read_is_replaced_by_the_collision_geometry(
     (tmp_path / "meshes/c.dae").write_text("<COLLADA/>")
     own = load_own(path)
     assert len(Shape(robot=own.robot).geoms) == 12
-    assert own.notes == ("camera is drawn by its collision geometry: MuJoCo does not read .dae",)
+    assert own.replaced == ("camera",)
     (tmp_path / "arm.urdf").write_text(urdf(Texts(more=more.replace("collision>", "nothing>"))))
     with pytest.raises(InputError, match="no collision geometry"):
         load_own(path)
@@ -216,7 +216,7 @@ WRONG = {
     '{frame = "right_tip"}': ('{frame = "right_tips"}', "Did you mean 'right_tip'"),
     'base = "base_link"': ('base = "link_j2"', "moves with the joint"),
     "offset_m = [0.0, 0.0, 0.05]": ("offset_m = [0.0, 0.02, 0.05]", ""),
-    "[gripper]": ("colour = 1\n[gripper]", "colour"),
+    "[gripper]": ("colors = 1\n[gripper]", "colors"),
     'joints = ["j1"': ('home = [9, 0, 0, 0, 0, 0, 0]\njoints = ["j1"', "(home)"),
     'model = "arm.urdf"': ('model = "gone.urdf"', "gone.urdf is missing"),
     "largest_opening_m": ("largest_opening", "no gripper.largest_opening_m"),

@@ -1,9 +1,11 @@
-"""Recorded joints of a robot of one's own become actions of its gripper in the frame of its base.
+"""Recorded joints of an own robot become actions of its gripper in the frame of its base.
 
 The dataset is rendered here: a table, a box and the moving arm, in a camera whose pose is known.
 """
 
 import json
+import shutil
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -11,12 +13,14 @@ import pytest
 
 pytest.importorskip("mink")
 pytest.importorskip("mujoco_menagerie")
+import pyarrow as pa
 import pyarrow.parquet as pq
 
 from egosim_jax.cli.__main__ import main
 from egosim_jax.data.lerobot_writer import ClipRecord, EpisodeRecord, write_lerobot
 from egosim_jax.geometry import invert, look_at, pixel_rays
 from egosim_jax.perception.video.estimates import DepthEstimate
+from egosim_jax.robots.description import read_description
 from egosim_jax.robots.drawing import Shape, draw
 from egosim_jax.robots.first_scene import estimate_depth, robot_depth, without_robot
 from egosim_jax.robots.own import load_own
@@ -94,7 +98,8 @@ def recorded(tmp_path_factory):
     """Folder with a robot, a dataset of it, and the depth of its first frame."""
     folder = tmp_path_factory.mktemp("robot")
     path = write_arm(folder, description=DESCRIPTION + RECORDING + camera_toml())
-    robot = load_own(path).robot
+    own = load_own(path)
+    robot = own.robot
     joints, share = motion()
     q = np.tile(robot.home, (COUNT, 1))
     q[:, robot.joint_at] = joints
@@ -117,22 +122,23 @@ def recorded(tmp_path_factory):
     episode = EpisodeRecord(clips=[clip], save_scene=lambda _: None)
     write_lerobot(folder / "set", [episode], names=NAMES, fps=FPS, robot_type="my_arm")
     np.savez(folder / "depth.npz", depth_m=drawn.depth_m[0])
-    return folder, drawn
+    return folder, drawn, own
 
 
-def described(recorded, tmp_path, text):
-    """Own model of another description of the robot."""
+def replay_of(recorded, **options):
+    return open_replay(recorded[0] / "set", 0, recorded[2], **options)
+
+
+def replay_as(recorded, tmp_path, text):
+    """The motion by the same model, with another description of camera and recording."""
     path = write_arm(tmp_path, description=text)
-    return load_own(path)
-
-
-def replay_of(folder, **options):
-    return open_replay(folder / "set", 0, load_own(folder / "my_arm.toml"), **options)
+    own = replace(recorded[2], description=read_description(path))
+    return open_replay(recorded[0] / "set", 0, own)
 
 
 def test_the_keypoints_are_the_tips_of_the_urdf_and_the_video_is_the_target(recorded):
-    folder, drawn = recorded
-    replay = replay_of(folder)
+    folder, drawn, _ = recorded
+    replay = replay_of(recorded)
     robot_m = robot_depth(replay)
     image, mask = without_robot(replay, robot_m)
     depth = np.where(mask, np.nan, np.load(folder / "depth.npz")["depth_m"])
@@ -151,8 +157,8 @@ def test_the_keypoints_are_the_tips_of_the_urdf_and_the_video_is_the_target(reco
 
 
 def test_the_robot_is_where_the_video_shows_it_and_is_removed_from_the_scene(recorded):
-    folder, drawn = recorded
-    replay = replay_of(folder)
+    _, drawn, _ = recorded
+    replay = replay_of(recorded)
     robot_m = robot_depth(replay)
     np.testing.assert_array_equal(np.isfinite(robot_m) & (robot_m < drawn.depth_m[0] + 1e-4),
                                   drawn.mask[0])  # fmt: skip
@@ -163,14 +169,13 @@ def test_the_robot_is_where_the_video_shows_it_and_is_removed_from_the_scene(rec
 
 def test_commands_are_for_the_next_frame(recorded):
     """The writer's action is the row of the next frame, so both columns give one motion."""
-    folder, _ = recorded
-    measured, commanded = replay_of(folder), replay_of(folder, column="action")
+    measured, commanded = replay_of(recorded), replay_of(recorded, column="action")
     np.testing.assert_allclose(measured.base_from_grip, commanded.base_from_grip, atol=1e-6)
 
 
 def test_estimated_depth_gets_its_scale_from_the_robot(recorded):
-    folder, drawn = recorded
-    replay = replay_of(folder)
+    _, drawn, _ = recorded
+    replay = replay_of(recorded)
 
     def estimator(frames, moving, estimate, wanted):
         return DepthEstimate.measured(wanted, 3.7 * drawn.depth_m[:1], metric=False)
@@ -181,7 +186,7 @@ def test_estimated_depth_gets_its_scale_from_the_robot(recorded):
 
 
 def test_the_command_writes_an_episode_that_is_simulated_and_scored(recorded, tmp_path, capsys):
-    folder, _ = recorded
+    folder, *_ = recorded
     out = tmp_path / "episode"
     args = ["robot", "actions", str(folder / "set"), "--robot", str(folder / "my_arm.toml")]
     args += ["--depth", str(folder / "depth.npz"), "--config", "debug", "--out", str(out)]
@@ -225,9 +230,8 @@ def test_the_command_writes_an_episode_that_is_simulated_and_scored(recorded, tm
 def test_what_the_dataset_contradicts_is_refused(recorded, tmp_path, change, said):
     text = DESCRIPTION + RECORDING + camera_toml()
     assert change[0] in text
-    path = write_arm(tmp_path, description=text.replace(*change))
     with pytest.raises(InputError) as caught:
-        open_replay(recorded[0] / "set", 0, load_own(path))
+        replay_as(recorded, tmp_path, text.replace(*change))
     assert said in str(caught.value)
     assert str(caught.value).isprintable()
 
@@ -235,25 +239,21 @@ def test_what_the_dataset_contradicts_is_refused(recorded, tmp_path, change, sai
 def test_radians_that_are_called_degrees_are_refused(recorded, tmp_path):
     folder = recorded[0]
     copied = tmp_path / "set"
-    import shutil
-
     shutil.copytree(folder / "set", copied)
     path = next((copied / "data").rglob("*.parquet"))
     table = pq.read_table(path)
     for name in ("observation.state", "action"):
         rows = np.array(table[name].to_pylist())
         rows[:, :-1] = np.radians(rows[:, :-1])
-        import pyarrow as pa
-
         column = pa.array(rows.tolist(), table[name].type)
         table = table.set_column(table.schema.get_field_index(name), name, column)
     pq.write_table(table, path)
     with pytest.raises(InputError, match="seem to be radians"):
-        open_replay(copied, 0, load_own(folder / "my_arm.toml"))
+        open_replay(copied, 0, recorded[2])
 
 
 def test_depth_that_contradicts_the_robot_is_refused(recorded, tmp_path, capsys):
-    folder, drawn = recorded
+    folder, drawn, _ = recorded
     np.savez(tmp_path / "far.npz", depth_m=10 * drawn.depth_m[0])
     args = ["robot", "actions", str(folder / "set"), "--robot", str(folder / "my_arm.toml")]
     args += ["--config", "debug", "--out", str(tmp_path / "episode"), "--depth"]
