@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from egosim_jax.io.bounded import listing, quote, quote_path
+from egosim_jax.io.bounded import listing, own_file, quote, quote_path
 from egosim_jax.robots.description import Description
 from egosim_jax.robots.models import TABLE, RobotModel, grip_of, limits_of
 from egosim_jax.types import InputError
@@ -33,6 +34,28 @@ MAX_CHAIN_M = 8.0
 WIDE_M = 1.0
 """Size of a geometry that any robot may have, also a small one."""
 UNITS = "Models are in meters: scale an export in millimeters by 0.001. (model)"
+
+
+def compile_mjcf(spec: Any, path: Path) -> None:
+    """Compile an MJCF; MuJoCo names only the first file that is missing, `InputError` all."""
+    try:
+        spec.compile()
+    except ValueError:
+        _check_assets(spec, path)
+        raise
+
+
+def _check_assets(spec: Any, path: Path) -> None:
+    """Raise `InputError` with the names of the meshes and textures of an MJCF that are missing."""
+    files = [(spec.compiler.meshdir, asset.file) for asset in [*spec.meshes, *spec.hfields]]
+    files += [(spec.compiler.texturedir, asset.file) for asset in spec.textures]
+    named = [f"{folder}/{file}" if folder else file for folder, file in files if file]
+    missing = [file for file in dict.fromkeys(named) if own_file(path.parent, file) is None]
+    if missing:
+        raise InputError(
+            f"{quote_path(path)} names {len(missing)} files that are missing: "
+            f"{listing([quote(file) for file in missing])}. Restore them."
+        )
 
 
 def check_closing(described: Description, opened: np.ndarray, closed: np.ndarray) -> None:

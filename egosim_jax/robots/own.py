@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from egosim_jax.geometry import invert, transform
-from egosim_jax.io.bounded import listing, own_file, quote, quote_path, refusing
+from egosim_jax.io.bounded import listing, quote, quote_path, refusing
 from egosim_jax.io.untrusted.isolated import read_file
 from egosim_jax.io.untrusted.mjcf import check_files
 from egosim_jax.io.untrusted.xml_tree import parse_xml
@@ -28,6 +28,7 @@ from egosim_jax.robots.checks import (
     check_gripper,
     check_length,
     check_sizes,
+    compile_mjcf,
     with_reach,
 )
 from egosim_jax.robots.description import SUFFIX, Description, read_description
@@ -99,26 +100,13 @@ def _load(path: Path, described: Description) -> OwnModel:
         elif root.tag == "mujoco":
             check_files(path.parent)
             urdf = Urdf(spec=mujoco.MjSpec.from_file(str(path)))
-            _check_assets(urdf.spec, path)
+            compile_mjcf(urdf.spec, path)
         else:
             raise InputError(
                 f"{name} begins with <{quote(root.tag)[1:-1]}>: it must be a URDF (<robot>) or an "
                 "MJCF (<mujoco>). Expand a xacro first."
             )
         return _checked(described, urdf)
-
-
-def _check_assets(spec: Any, path: Path) -> None:
-    """Raise `InputError` with the names of the meshes and textures of an MJCF that are missing."""
-    files = [(spec.compiler.meshdir, asset.file) for asset in [*spec.meshes, *spec.hfields]]
-    files += [(spec.compiler.texturedir, asset.file) for asset in spec.textures]
-    named = [f"{folder}/{file}" if folder else file for folder, file in files if file]
-    missing = [file for file in dict.fromkeys(named) if own_file(path.parent, file) is None]
-    if missing:
-        raise InputError(
-            f"{quote_path(path)} names {len(missing)} files that are missing: "
-            f"{listing([quote(file) for file in missing])}. Restore them."
-        )
 
 
 def _checked(described: Description, urdf: Urdf) -> OwnModel:
