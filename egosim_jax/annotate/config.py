@@ -217,6 +217,14 @@ def build_segmenter(
     return cast(Segmenter, _import(_MASKS[name])(*folders, **where))
 
 
+def build_depth(depth: str, *, option: str = "--depth", **where: Any) -> DepthEstimator:
+    """Return the depth network of a text such as depth-pro=FOLDER, for single images."""
+    name, folder = _find(_DEPTH, depth, option)
+    if folder is None or name == "files":
+        raise InputError(f"{option} {quote(depth)} must be a network and its folder.")
+    return cast(DepthEstimator, _import(_DEPTH[name])(folder, **where))
+
+
 def _check_detector(masks: str, detector: Path | None, option: str) -> None:
     """Raise `InputError` unless a tracker has a detector, and nothing else has one."""
     name, _ = _find(_MASKS, masks, option)

@@ -74,8 +74,8 @@ class MakeEpisode:
         check_counts({"--clips": self.clips})
         check_seed(self.seed or 0)
         if not self.actions:
-            return _save(self._tabletop(), self.out)
-        return _save(self._own(), self.out, describe=True)
+            return save_episode(self._tabletop(), self.out)
+        return save_episode(self._own(), self.out, describe=True)
 
     def _tabletop(self) -> episodes.Episode:
         from egosim_jax import configs
@@ -141,7 +141,7 @@ class MakeEpisode:
                 f"--{given[0]} needs --image and --depth: the state of --state has its own objects."
             )
         if self.state is not None and self.depth is None:
-            return _read_state(self.state), frame
+            return read_state(self.state), frame
         raise InputError("The scene must be given once: by --state, or by --image and --depth.")
 
     def _lift(
@@ -221,7 +221,7 @@ class FromAnnotation:
 
         check_counts({"--clips": self.clips})
         episode = episode_from(self.clip, configs.get(self.config).video, clips=self.clips)
-        return _save(episode, self.out, describe=True)
+        return save_episode(episode, self.out, describe=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,12 +253,12 @@ class FromLeRobot:
         from egosim_jax.annotate.lerobot_episode import episode_from_lerobot
 
         check_counts({"--clips": self.clips})
-        state = None if self.state is None else _read_state(self.state)
+        state = None if self.state is None else read_state(self.state)
         video = configs.get(self.config).video
         episode = episode_from_lerobot(
             self.dataset, self.episode, video, state=state, clips=self.clips
         )
-        return _save(episode, self.out, describe=True)
+        return save_episode(episode, self.out, describe=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -353,13 +353,14 @@ class ShowEpisode:
         return np.where((depth_m < view.depth_m)[..., None], hands, view.frames)
 
 
-def _read_state(path: Path) -> SceneState:
+def read_state(path: Path) -> SceneState:
+    """Read the folder of a state, or a .ply of colored points."""
     from egosim_jax.state.snapshot import load, read_ply
 
     return (read_ply if path.suffix == ".ply" else load)(path)
 
 
-def _save(episode: episodes.Episode, out: Path, *, describe: bool = False) -> int:
+def save_episode(episode: episodes.Episode, out: Path, *, describe: bool = False) -> int:
     """Check and write the episode; print its summary and, with `describe`, its objects.
 
     Raises `InputError` if there is another episode: it may have been edited.

@@ -7,13 +7,19 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from egosim_jax.runtime.command import ExitCode, group
+from egosim_jax.runtime.command import ExitCode, Writes, group
 from egosim_jax.runtime.terminal import make_console, print_line
-from egosim_jax.types import InputError
+from egosim_jax.types import InputError, check_counts
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from egosim_jax.robots.recorded import Replay
+    from egosim_jax.types import SceneState
 
 VIDEO, SHEET, REPORT = "robot.mp4", "sheet.jpg", "report.json"
 DATASET, TRIPLETS = "lerobot", "triplets"
@@ -52,7 +58,7 @@ class Render:
     An episode with ground truth (`egosim episode make`), a clip of `egosim data annotate`, a run of
     `egosim simulate`, or a session of `egosim serve` or `egosim play`."""
     robot: str
-    """Name in `egosim robot list`."""
+    """Name in `egosim robot list`, or the .toml file of your own robot (docs/robot.md)."""
     out: Path
     """Folder to write, new or empty."""
     hands: Literal["acting", "all"] = "acting"
@@ -71,7 +77,6 @@ class Render:
         from egosim_jax.io.run import write_json
         from egosim_jax.io.writing import write_video
         from egosim_jax.rendering import get
-        from egosim_jax.robots.arms import arm_of
         from egosim_jax.robots.conversion import (
             convert,
             export,
@@ -79,12 +84,12 @@ class Render:
             triplets_of,
             video_of,
         )
-        from egosim_jax.robots.models import load_model
+        from egosim_jax.robots.own import open_robot
         from egosim_jax.robots.sources import open_source
 
-        arm = arm_of(self.robot)
         check_new(self.out)
-        robot = load_model(arm)
+        robot = open_robot(self.robot)
+        arm = robot.arm
         began = time.monotonic()
         source = open_source(self.source)
         episode = source.episode
@@ -129,11 +134,134 @@ def _words(entry: Mapping[str, Any]) -> str:
     return words
 
 
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """Check the description of your own robot: its URDF or MJCF, its gripper and its units.
+
+    Prints the parts of the model that the description names, or the first problem and its fix.
+    Nothing is written.
+    """
+
+    robot: Annotated[Path, tyro.conf.Positional]
+    """Description, a .toml file (docs/robot.md)."""
+
+    def run(self) -> int:
+        """Print the arm, its gripper, and the frames that the description gives."""
+        from egosim_jax.robots.own import load_own
+        from egosim_jax.robots.own_report import lines_of
+
+        for line in lines_of(load_own(self.robot)):
+            print_line(line)
+        return ExitCode.DONE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Actions:
+    """Make an episode of recorded joints: a LeRobot dataset (version 3.0) of your own robot.
+
+    The description says which values are the arm's joints and the gripper, in which unit, and where
+    the camera is (docs/robot.md). The joints become actions of the gripper, in the frame of the
+    robot's base. The recorded video is the ground truth, so `egosim simulate` scores against it.
+    The scene is the first frame without the robot: give its depth, or a --state.
+    """
+
+    writes: ClassVar[Writes] = "folder or .zip file"
+    dataset: Annotated[Path, tyro.conf.Positional]
+    """Folder of the dataset, with meta/info.json."""
+    robot: Path
+    """Description of the robot, a .toml file with [recording] and [camera]."""
+    out: Path
+    """Folder to write, or a file whose name ends in .zip."""
+    episode: int = 0
+    """Number of the episode in the dataset."""
+    joints: Literal["observation.state", "action"] = "observation.state"
+    """Joints to follow: the measured ones, or the commands, each for the next frame."""
+    depth: str | None = None
+    """Depth of the first frame: an .npz file with depth_m in meters, or NETWORK=FOLDER.
+
+    Networks are depth-anything, depth-anything-3 and depth-pro; the robot gives the scale."""
+    state: Path | None = None
+    """Folder of a state, or a .ply of colored points, in the frame of the base, without depth."""
+    objects: str = "auto"
+    """Movable objects of the first frame: auto, none, or a .png of ids (see `egosim episode`)."""
+    names: tuple[str, ...] = ()
+    """Names of objects, each ID=NAME; by default "object 1" and so on."""
+    config: str = "tabletop"
+    """Model whose length, size and frame rate the clips have."""
+    clips: int | None = None
+    """Number of clips; by default as many as fit into the episode."""
+    device: str = "auto"
+    """Device of a depth network: cpu, cuda, cuda:N, or auto for the first GPU if there is one."""
+
+    def run(self) -> int:
+        """Check robot, dataset and camera, and write the episode."""
+        from egosim_jax import configs
+        from egosim_jax.cli.episode import save_episode
+        from egosim_jax.robots.own import load_own
+        from egosim_jax.robots.recorded import episode_of, open_replay
+
+        check_counts({"--clips": self.clips})
+        if (self.depth is None) == (self.state is None):
+            raise InputError(
+                "The scene must be given once: the depth of the first frame, as an .npz file with "
+                "depth_m or as a network, or a state. (--depth, --state)"
+            )
+        video = configs.get(self.config).video
+        own = load_own(self.robot)
+        replay = open_replay(self.dataset, self.episode, own, column=self.joints)
+        state, image = self._scene(replay)
+        episode = episode_of(replay, video, state, first_frame=image, clips=self.clips)
+        return save_episode(episode, self.out, describe=True)
+
+    def _scene(self, replay: Replay) -> tuple[SceneState, np.ndarray]:
+        """Return the scene and the first frame, both without the robot."""
+        import numpy as np
+
+        from egosim_jax.cli.episode import read_state
+        from egosim_jax.cli.objects import names_of, objects_of
+        from egosim_jax.robots.first_scene import robot_depth, without_robot
+        from egosim_jax.state.depth import state_from_depth
+
+        robot_m = robot_depth(replay)
+        image, mask = without_robot(replay, robot_m)
+        print_line(f"the robot covers {np.isfinite(robot_m).mean():.1%} of the first frame")
+        if self.state is not None:
+            return read_state(self.state), image
+        depth_m = np.where(mask, np.nan, self._depth(replay, robot_m))
+        intrinsics, pose = replay.camera.intrinsics_px, replay.camera.world_from_camera[0]
+        ids, known = objects_of(self.objects, image, depth_m, intrinsics)
+        names = names_of(ids, known, self.names)
+        scene = state_from_depth(image, depth_m, intrinsics, pose, object_ids=ids, names=names)
+        return scene, image
+
+    def _depth(self, replay: Replay, robot_m: np.ndarray) -> np.ndarray:
+        """Return the depth of the first frame in meters, compared with the robot's own."""
+        from egosim_jax.annotate.config import build_depth
+        from egosim_jax.io.untrusted.npz import read_arrays
+        from egosim_jax.robots.first_scene import check_depth, estimate_depth
+
+        chosen = str(self.depth)
+        if "=" in chosen:
+            network = build_depth(chosen, device=self.device)
+            return estimate_depth(replay, robot_m, network, name=chosen)
+        path = Path(chosen)
+        depth_m = read_arrays(path, {}, others=("depth_m",), packed=True)["depth_m"]
+        if depth_m.shape != robot_m.shape:
+            raise InputError(
+                f"{path} has shape {depth_m.shape} and the video {robot_m.shape}: depth must have "
+                "one value per pixel of the first frame. (--depth)"
+            )
+        check_depth(replay, depth_m, robot_m, name=str(path))
+        return depth_m
+
+
 Robot = group(
     "Robot",
-    "Turn clips with hands into clips of robots, with their joint positions.",
+    "Turn clips with hands into clips of robots, and recordings of your own robot into episodes.",
     {
         "render": Render,
         "list": List,
+        "check": Check,
+        "actions": Actions,
     },
 )

@@ -125,12 +125,12 @@ def remove_hands(
             "one with ground truth, such as egosim episode make --seed 0. (SOURCE)"
         )
     edge_px = max(2, round(EDGE * cameras.width)) if estimated else 1
-    hidden = np.stack([_dilated(m < 0, edge_px) for m in ids])
+    hidden = np.stack([dilated(m < 0, edge_px) for m in ids])
     scene = cloud_of(state)
     if estimated:
         for n in np.flatnonzero(hidden.any(axis=(1, 2))).tolist():
             colors, seen_m, _ = scene.view(cameras, motions, n)
-            free = np.isfinite(seen_m) & ~_dilated(ids[n] > 0, edge_px)
+            free = np.isfinite(seen_m) & ~dilated(ids[n] > 0, edge_px)
             hidden[n] |= _sleeve(truth.frames[n], colors, hidden[n], free, edge_px)
     frames, depth, missing = truth.frames.copy(), known_m.copy(), hidden.copy()
     shadow, counts = 0, [int(hidden.sum())]
@@ -177,7 +177,8 @@ def remove_hands(
     )
 
 
-def _dilated(mask: Bool[np.ndarray, "h w"], pixels: int) -> Bool[np.ndarray, "h w"]:
+def dilated(mask: Bool[np.ndarray, "h w"], pixels: int) -> Bool[np.ndarray, "h w"]:
+    """Return a mask that is larger by some pixels on each side."""
     import cv2
 
     square = np.ones((2 * pixels + 1,) * 2, np.uint8)
@@ -198,10 +199,10 @@ def _sleeve(
     import cv2
 
     change = np.abs(image.astype(int) - colors).sum(axis=-1) > DIFFERENT
-    near = _dilated(hand, round(SLEEVE * image.shape[1]))
+    near = dilated(hand, round(SLEEVE * image.shape[1]))
     _, parts = cv2.connectedComponents((hand | (change & near & free)).astype(np.uint8))
     own = np.isin(parts, np.unique(parts[hand])) & ~hand
-    return _dilated(own, edge_px // 2) & free
+    return dilated(own, edge_px // 2) & free
 
 
 def _in_shadow(

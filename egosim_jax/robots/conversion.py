@@ -20,9 +20,9 @@ from egosim_jax.rendering import POINT_PX, PriorKind, Renderer
 from egosim_jax.robots.arms import Arm
 from egosim_jax.robots.background import Background, first_cloud, remove_hands
 from egosim_jax.robots.drawing import Drawn, Shape, draw
-from egosim_jax.robots.models import RobotModel
+from egosim_jax.robots.models import RobotModel, limits_of
 from egosim_jax.robots.placement import Base, Placed, place
-from egosim_jax.robots.retarget import Grips, continuous, grips_of
+from egosim_jax.robots.retarget import Grips, continuous, grips_of, keypoints_of
 from egosim_jax.robots.sources import Source
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.simulation.start import Start
@@ -31,8 +31,6 @@ from egosim_jax.types import Action, InputError, SceneState, Triplet, seen_hands
 
 Hands = Literal["acting", "all"]
 """Hands that get a robot: the one that moves most, or every one; all hands are removed."""
-WRIST_M = 0.12
-"""Distance of a gripper's wrist from its tips in exported skeletons."""
 AROUND_M = 0.25
 """Horizontal distance from the hand's path in which the table is searched."""
 BIN_M = 0.01
@@ -229,7 +227,9 @@ def _report(follower: Follower, fps: float) -> dict[str, Any]:
     pinch = track.base_from_grip[:, :3, 3] @ base[:3, :3].T + base[:3, 3]
     error = np.linalg.norm(pinch - grips.pinch_m, axis=1)
     joints = track.q[:, follower.robot.joint_at]
-    low, high = np.array([follower.robot.mj.joint(name).range for name in arm.joints]).T
+    ends = [limits_of(follower.robot.mj, name) or (-np.inf, np.inf) for name in arm.joints]
+    low, high = np.array(ends, float).T
+    margin = float(min((joints - low).min(), (high - joints).min()))
     speed = np.abs(np.diff(joints, axis=0)) * fps / np.array(arm.speeds)
     missed = np.flatnonzero(grips.seen & ~track.reached)
     return {
@@ -247,7 +247,7 @@ def _report(follower: Follower, fps: float) -> dict[str, Any]:
             "median": float(np.degrees(np.median(track.turn_error))),
             "max": float(np.degrees(track.turn_error.max())),
         },
-        "least_distance_from_limits": float(min((joints - low).min(), (high - joints).min())),
+        "least_distance_from_limits": margin if np.isfinite(margin) else None,
         "speed_in_limits": float(speed.max()) if speed.size else 0.0,
         "least_distance_from_table_m": float(track.clearance_m.min()),
         "least_distance_of_links_m": float(track.apart_m.min()),
@@ -334,11 +334,7 @@ def _skeletons(conversion: Conversion, clip: int, action: Action) -> Action:
     for follower in conversion.followers:
         track = follower.placed.track
         pose = follower.placed.world_from_base @ track.base_from_grip[span]
-        place, across, along = pose[:, :3, 3], pose[:, :3, 0], pose[:, :3, 2]
-        half = track.opening_m[span, None] / 2
-        hands.append(
-            np.stack([place - WRIST_M * along, place - half * across, place + half * across], 1)
-        )
+        hands.append(keypoints_of(pose, track.opening_m[span]))
     joints = np.stack(hands, axis=1)
     return Action(
         cameras=action.cameras,

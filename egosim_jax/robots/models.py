@@ -138,10 +138,11 @@ def _part(spec: Any, kind: str, name: str) -> Any:
     return found
 
 
-def make_model(arm: Arm, spec: Any) -> RobotModel:
+def make_model(arm: Arm, spec: Any, *, fix: str = RESTORE) -> RobotModel:
     """Return the model of an arm from its specification, with a plane for the table.
 
-    Raises `InputError` if a body, a joint or the equality of a finger is missing.
+    Raises `InputError`, which ends with `fix`, if a body, a joint or the equality of a finger is
+    missing.
     """
     mujoco: Any = import_module("mujoco")
 
@@ -156,11 +157,11 @@ def make_model(arm: Arm, spec: Any) -> RobotModel:
         _part(spec, "body", prefix + name)
     _part(spec, "body", prefix + arm.gripper.body).add_site(name=GRIP, group=5)
     mj = spec.compile()
-    _check_parts(mj, arm)
+    _check_parts(mj, arm, fix)
     mj.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     joints = [mj.joint(name) for name in arm.joints]
     gripper = [j for j in map(mj.joint, range(mj.njnt)) if j.name not in arm.joints]
-    openings, positions, grips = _sweep(mj, arm.gripper, prefix, gripper)
+    openings, positions, grips = _sweep(mj, arm.gripper, prefix, gripper, fix)
     site = mj.site(GRIP).id
     # The compiler marks frames at the origin of its body, and MuJoCo then ignores its own pose.
     mj.site_sameframe[site] = mj.geom_sameframe[mj.geom(TABLE).id] = 0
@@ -178,26 +179,26 @@ def make_model(arm: Arm, spec: Any) -> RobotModel:
     )
 
 
-def _check_parts(mj: Any, arm: Arm) -> None:
+def _check_parts(mj: Any, arm: Arm, fix: str) -> None:
     """Raise `InputError` for too many parts, and for a joint that has more than one position."""
     mujoco: Any = import_module("mujoco")
 
     if max(mj.ngeom, mj.nv) > MAX_PARTS:
         raise InputError(
             f"The robot's model has {mj.ngeom:,} geometries and {mj.nv:,} degrees of freedom: it "
-            f"may have at most {MAX_PARTS} of each; {RESTORE}"
+            f"may have at most {MAX_PARTS} of each; {fix}"
         )
     single = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     for n in range(mj.njnt):
         if mujoco.mjtJoint(int(mj.jnt_type[n])) not in single:
             raise InputError(
                 f"The joint {quote(mj.joint(n).name)} of the robot's model is neither a hinge nor "
-                f"a slide, which {arm.title} has; {RESTORE}"
+                f"a slide, which {arm.title} has; {fix}"
             )
 
 
 def _sweep(
-    mj: Any, gripper: Gripper, prefix: str, joints: list[Any]
+    mj: Any, gripper: Gripper, prefix: str, joints: list[Any], fix: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return opening, joint positions and grip while the driver moves from closed to open."""
     mujoco: Any = import_module("mujoco")
@@ -210,22 +211,22 @@ def _sweep(
     gaps, positions, grips, places = [], [], [], []
     for value in np.linspace(gripper.open, gripper.closed, OPENINGS):
         data.qpos[driver.qposadr[0]] = value
-        _close_loops(mj, data, free, follow)
-        body = _pose(data.body(prefix + gripper.body))
-        tips = [_point(data.body(prefix + name), point) for name, point in gripper.tips]
+        close_loops(mj, data, free, follow)
+        body = pose_of(data.body(prefix + gripper.body))
+        tips = [tip_point(data.body(prefix + name), point) for name, point in gripper.tips]
         first, second = ((tip - body[:3, 3]) @ body[:3, :3] for tip in tips)
         places.append([first, second])
         grips.append(_grip(first, second, np.array(gripper.approach, float)))
         gaps.append((second - first) @ grips[0][:3, 0])
         positions.append(data.qpos[at])
-    _check_fingers(mj, gripper, prefix, np.array(places))
+    _check_fingers(mj, gripper, prefix, np.array(places), fix)
     gaps = np.array(gaps) - gaps[-1]
     order = np.argsort(gaps)
     return gaps[order], np.array(positions)[order], np.array(grips)[order]
 
 
 def _check_fingers(
-    mj: Any, gripper: Gripper, prefix: str, places: Float[np.ndarray, "n 2 3"]
+    mj: Any, gripper: Gripper, prefix: str, places: Float[np.ndarray, "n 2 3"], fix: str
 ) -> None:
     """Raise `InputError` if two fingers with joints do not move alike.
 
@@ -244,11 +245,11 @@ def _check_fingers(
         raise InputError(
             "The fingers of the robot's model move {:.1f} and {:.1f} mm ".format(*1000 * travels_m)
             + f"with the joint {gripper.driver!r}: an equality of {names[0]!r} is missing or "
-            f"wrong; {RESTORE}"
+            f"wrong; {fix}"
         )
 
 
-def _close_loops(mj: Any, data: Any, free: np.ndarray, follow: np.ndarray) -> None:
+def close_loops(mj: Any, data: Any, free: np.ndarray, follow: np.ndarray) -> None:
     """Move the joints that follow the driver until the model's equalities hold (Gauss-Newton)."""
     mujoco: Any = import_module("mujoco")
 
@@ -272,11 +273,13 @@ def _grip(first: np.ndarray, second: np.ndarray, approach: np.ndarray) -> np.nda
     return pose
 
 
-def _point(body: Any, point: tuple[float, float, float]) -> np.ndarray:
+def tip_point(body: Any, point: tuple[float, float, float]) -> np.ndarray:
+    """Return a point of a body in the world."""
     return body.xpos + body.xmat.reshape(3, 3) @ np.array(point, float)
 
 
-def _pose(body: Any) -> Float[np.ndarray, "4 4"]:
+def pose_of(body: Any) -> Float[np.ndarray, "4 4"]:
+    """Return the pose of a body in the world."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = body.xmat.reshape(3, 3), body.xpos
     return pose
@@ -292,3 +295,18 @@ def grip_of(robot: RobotModel, data: Any) -> Float[np.ndarray, "4 4"]:
     pose[:3, :3] = data.site_xmat[robot.site].reshape(3, 3)
     pose[:3, 3] = data.site_xpos[robot.site]
     return pose
+
+
+def limits_of(mj: Any, joint: str) -> tuple[float, float] | None:
+    """Return the limits of a joint; None if it has none."""
+    if not mj.jnt_limited[mj.joint(joint).id]:
+        return None
+    low, high = mj.joint(joint).range.tolist()
+    return low, high
+
+
+def is_slide(mj: Any, joint: str) -> bool:
+    """Return True for a joint that slides, False for a hinge."""
+    mujoco: Any = import_module("mujoco")
+
+    return int(mj.jnt_type[mj.joint(joint).id]) == int(mujoco.mjtJoint.mjJNT_SLIDE)

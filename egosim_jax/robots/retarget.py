@@ -19,6 +19,8 @@ SMOOTHING_S = 0.04
 """Standard deviation of the filter of places over time, in seconds: estimated hands tremble."""
 GRADUAL_S = 0.08
 """The same for directions and openings: both change at once when fingers close, no gripper does."""
+WRIST_M = 0.12
+"""Distance of a gripper's wrist from its tips in its keypoints."""
 MIN_ACROSS_M = 1e-3
 """Distance of the fingertips below which they give no direction."""
 
@@ -46,6 +48,15 @@ def tips_of(joints_m: Float[np.ndarray, "*f j 3"]) -> tuple[np.ndarray, np.ndarr
     if joints_m.shape[-2] == 3:
         return joints_m[..., 1, :], joints_m[..., 2, :]
     return joints_m[..., 4, :], joints_m[..., [8, 12], :].mean(axis=-2)
+
+
+def keypoints_of(
+    world_from_grip: Float[np.ndarray, "f 4 4"], opening_m: Float[np.ndarray, " f"]
+) -> Float[np.ndarray, "f 3 3"]:
+    """Return the three keypoints of a gripper: its wrist and both tips."""
+    place, across, along = (world_from_grip[:, :3, n] for n in (3, 0, 2))
+    half = opening_m[:, None] / 2
+    return np.stack([place - WRIST_M * along, place - half * across, place + half * across], 1)
 
 
 def grips_of(joints_m: Float[np.ndarray, "f j 3"], *, fps: int | float) -> Grips:

@@ -1,4 +1,4 @@
-"""Fuzzing target: MuJoCo models of robots, with what they include, draw and measure."""
+"""Fuzzing targets: MuJoCo models of robots, and described robots with their URDF and mesh."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ from PIL import Image
 from egosim_jax.robots.drawing import Shape
 from egosim_jax.robots.ik import Solver
 from egosim_jax.robots.models import load_model
+from egosim_jax.robots.own import load_own
 from tests.fuzz.outside import STL, outside, place_special
 from tests.fuzz.target import Target, pixels
+from tests.unit.robots.own_arm import write_arm
 from tests.unit.robots.toy import TOY, XML
 
 ARM = replace(TOY, model=("franka_emika_panda", "panda"))
@@ -59,6 +61,17 @@ def read(folder: Path) -> Any:
     q = Solver(robot).approach(robot.home, pose, robot.largest_m, steps=2)
     meshes = Shape(robot=robot).pose(q, robot.largest_m, np.eye(4))
     return robot.positions, robot.openings_m, q.round(4), meshes
+
+
+def make_own(folder: Path) -> None:
+    """Write a described robot with its URDF and a mesh."""
+    write_arm(folder)
+
+
+def read_own(folder: Path) -> Any:
+    """Load the described robot and take its drawn meshes."""
+    robot = load_own(folder / "my_arm.toml").robot
+    return robot.positions, robot.openings_m, Shape(robot=robot).pose(robot.home, 0.0, np.eye(4))
 
 
 HUGE = (
@@ -220,5 +233,14 @@ TARGETS: list[Target] = [
         lossy="a model has no checksum: another number is as good as the one before",
         mutations=(other_model,) * 8,
         rearrangements=(place_special,),
-    )
+    ),
+    Target(
+        name="described robot",
+        make=make_own,
+        read=read_own,
+        files=("*.urdf", "*.urdf", "*.toml", "meshes/*"),
+        lossy="a model has no checksum: another number is as good as the one before",
+        mutations=(other_model,) * 8,
+        rearrangements=(place_special,),
+    ),
 ]

@@ -221,6 +221,21 @@ def read_rows(
     Raises `InputError` if there is no such episode, or if its frames are not the ones that its
     description names.
     """
+    path, length = table_of(root, info, episode)
+    frames = read_parquet(path, ["episode_index", "frame_index", *columns], optional=optional)
+    chosen = [n for n, index in enumerate(frames["episode_index"]) if index == episode]
+    chosen.sort(key=lambda n: frames["frame_index"][n])
+    if [frames["frame_index"][n] for n in chosen] != list(range(length)):
+        raise InputError(
+            f"{quote_path(path)} has {len(chosen)} frames of episode {episode}, meta/episodes says "
+            f"{length}, from 0 without gaps. Download both again."
+        )
+    names = [name for name in (*columns, *optional) if name in frames]
+    return {name: [frames[name][n] for n in chosen] for name in names}
+
+
+def table_of(root: Path, info: Mapping[str, Any], episode: int) -> tuple[Path, int]:
+    """Return the table of an episode's frames, and their number."""
     require("pyarrow")
     places = ["episode_index", "length", "data/chunk_index", "data/file_index"]
     known = 0
@@ -237,17 +252,7 @@ def read_rows(
         )
     row = {name: _count(values[number], name) for name, values in table.items()}
     fields = {name: row[f"data/{name}"] for name in ("chunk_index", "file_index")}
-    path = _fill(root, info.get("data_path"), fields, what="data_path")
-    frames = read_parquet(path, ["episode_index", "frame_index", *columns], optional=optional)
-    chosen = [n for n, index in enumerate(frames["episode_index"]) if index == episode]
-    chosen.sort(key=lambda n: frames["frame_index"][n])
-    if [frames["frame_index"][n] for n in chosen] != list(range(row["length"])):
-        raise InputError(
-            f"{quote_path(path)} has {len(chosen)} frames of episode {episode}, meta/episodes says "
-            f"{row['length']}, from 0 without gaps. Download both again."
-        )
-    names = [name for name in (*columns, *optional) if name in frames]
-    return {name: [frames[name][n] for n in chosen] for name in names}
+    return _fill(root, info.get("data_path"), fields, what="data_path"), row["length"]
 
 
 def _fail(problem: str, folder: Path) -> Recording:

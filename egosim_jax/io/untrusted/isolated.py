@@ -165,6 +165,11 @@ def read_file(
     name = quote_path(path)
     max_memory, max_cpu_s = max_memory or MAX_MEMORY, max_cpu_s or MAX_CPU_S
     try:
+        if max_memory > MAX_MEMORY:
+            _GROWN.set()
+        elif _GROWN.is_set():  # what the child keeps of more memory, this file would lack
+            _READER.close()
+            _GROWN.clear()
         return _READER.call(
             _limited, max_memory, max_cpu_s, read, path, *arguments, timeout_s=TIMEOUT_S
         )
@@ -228,5 +233,5 @@ def _receive(connection: Connection, calls: SimpleQueue[bytes]) -> None:
     os._exit(1)
 
 
-_READER = Child(max_memory=MAX_ADDRESSES)
+_READER, _GROWN = Child(max_memory=MAX_ADDRESSES), threading.Event()
 atexit.register(_READER.close)

@@ -20,12 +20,11 @@ from egosim_jax.io.bounded import (
     real_path,
     refusing,
 )
+from egosim_jax.io.untrusted.xml_tree import MAX_XML_BYTES
 from egosim_jax.types import InputError
 
 MAX_FILES = 10_000
 """Maximum number of files and folders of a model."""
-MAX_XML_BYTES = 16 << 20
-"""Maximum size of an XML file in bytes."""
 OUTSIDE = re.compile(r"[/\\]|[A-Za-z]:|(.*[/\\])?\.\.([/\\]|$)", re.DOTALL)
 """Beginning of a path that can lead out of a folder; MuJoCo takes both slashes."""
 

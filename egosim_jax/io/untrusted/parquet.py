@@ -16,6 +16,8 @@ MAX_COLUMN_BYTES = 1 << 26
 """Largest size of the columns that are read, in bytes, unpacked."""
 MAX_VALUES = 1 << 23
 """Maximum number of values of the columns that are read, each 32 bytes or more in Python."""
+MAX_IMAGES_BYTES = 1 << 27
+"""Maximum size of the encoded images that one call returns, in bytes."""
 
 
 def read_parquet(
@@ -31,6 +33,56 @@ def read_parquet(
         name: values.tolist() if isinstance(values, np.ndarray) else values
         for name, values in found.items()
     }
+
+
+def read_image_rows(path: Path, column: str, episode: int, frames: Sequence[int]) -> list[bytes]:
+    """Return the encoded images of some frames of an episode, from a LeRobot table.
+
+    Raises `InputError` as `read_parquet` does, if a frame is missing or has no bytes, and for more
+    than `MAX_IMAGES_BYTES`.
+    """
+    return read_file(_read_images, path, column, episode, list(frames))
+
+
+def _read_images(path: Path, column: str, episode: int, frames: list[int]) -> list[bytes]:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    name, found, size = quote_path(path), {}, 0
+    wanted = set(frames)
+    with open_regular(path) as file:
+        try:
+            opened = pq.ParquetFile(file)
+            if column not in opened.schema_arrow.names:
+                raise InputError(f"{name} has no column {quote_text(column)}.")
+            columns = [column, "episode_index", "frame_index"]
+            for batch in opened.iter_batches(batch_size=16, columns=columns, use_threads=False):
+                numbers = [batch.column(n).to_pylist() for n in (1, 2)]
+                for row, (owner, frame) in enumerate(zip(*numbers, strict=True)):
+                    if owner == episode and frame in wanted:
+                        image = batch.column(0)[row].as_py()
+                        data = image.get("bytes") if isinstance(image, dict) else None
+                        if not isinstance(data, bytes):
+                            raise InputError(
+                                f"{name}: frame {frame} of {quote_text(column)} has no bytes of an "
+                                "image. Export the dataset with its images."
+                            )
+                        size += len(data)
+                        if size > MAX_IMAGES_BYTES:
+                            raise InputError(
+                                f"{name} has more than {MAX_IMAGES_BYTES:,} bytes in "
+                                f"{len(frames)} images: store smaller images, or a video."
+                            )
+                        found[frame] = data
+        except (pa.ArrowException, OSError, ValueError) as error:
+            if isinstance(error, (InputError, MemoryError)):
+                raise
+            raise InputError(
+                f"{name} is not a readable Parquet file: {quote_text(str(error))}."
+            ) from error
+    if missing := [frame for frame in frames if frame not in found]:
+        raise InputError(f"{name} has no image of frame {missing[0]} of episode {episode}.")
+    return [found[frame] for frame in frames]
 
 
 def _read(
