@@ -1,0 +1,1 @@
+"""Worlds for training libraries: flat numbers, and adapters of environments."""
