@@ -164,7 +164,8 @@ class LookAway(ModelExperiment):
 
     A hand moves the object in view, or out of view. The state is updated by the oracle, by
     classical perception, or not at all. Prints a table and the differences from no update. Writes
-    report.json and contact_sheet.png. The same command resumes an interrupted experiment.
+    report.json and contact_sheet.png, and in wrbench the videos as WRBench's evaluation reads them.
+    The same command resumes an interrupted experiment.
     """
 
     scenes: Count = 12
@@ -207,7 +208,7 @@ class TrainPolicy(Checked):
     """Library whose PPO trains the policy, through its adapter of our environment."""
     config: str = "preview"
     """Name of the model whose world the policy is trained in; `preview` needs no weights."""
-    rounds: Count = 24
+    rounds: Count = 10
     """Number of updates of PPO."""
     steps: Count = 4
     """Number of clips of each episode of the batch in an update."""
@@ -215,11 +216,11 @@ class TrainPolicy(Checked):
     """Number of episodes that are simulated together."""
     demonstrations: Count = 10
     """Number of demonstrations that the first policy is fitted to."""
-    scenes: Count = 64
+    scenes: Count = 32
     """Number of scenes of the training."""
     first_scene: Seed = 300
     """Seed of the first scene of the training; the shipped model was trained on seeds from 1000."""
-    tests: Count = 40
+    tests: Count = 24
     """Number of scenes in which the policies are judged."""
     first_test: Seed = 500
     """Seed of the first of these scenes."""

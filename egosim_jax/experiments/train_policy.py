@@ -16,7 +16,7 @@ import numpy as np
 from egosim_jax.evaluation.metrics.report import paired_difference, print_table
 from egosim_jax.experiments.config import TrainPolicy
 from egosim_jax.experiments.ppo import LIBRARIES, Weights
-from egosim_jax.experiments.report import cached, write_report
+from egosim_jax.experiments.report import cached, share, write_report
 from egosim_jax.interactive.env import ActionSpec, load_backend, make_vec
 from egosim_jax.interactive.env.backends import Backend, tabletop_start
 from egosim_jax.interactive.env.chunks import make_chunk
@@ -179,13 +179,3 @@ def _report(
     clips = settings.rounds * settings.steps * settings.batch_size
     title = f"success in {len(tests)} scenes; PPO of {settings.library}, {clips} clips"
     print_table("policy", table, WORLDS, title=title)
-
-
-def share(values: Sequence[bool]) -> dict[str, float]:
-    """Return a share in percent with Wilson's 95 % interval, which is right for few values."""
-    from scipy.stats import binomtest
-
-    hits = sum(values)
-    interval = binomtest(hits, len(values)).proportion_ci(method="wilson")
-    low, high = 100 * float(interval.low), 100 * float(interval.high)
-    return {"mean": 100 * hits / len(values), "low": low, "high": high}
