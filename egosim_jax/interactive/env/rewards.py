@@ -59,10 +59,7 @@ REWARDS: Registry[RewardFn] = Registry(
     "reward",
     "reward",
     "egosim_jax.rewards",
-    {
-        "move_object": "egosim_jax.interactive.env.rewards:MoveObject",
-        "lift": "egosim_jax.interactive.learn.lift:Lift",
-    },
+    {"lift": "egosim_jax.interactive.learn.lift:Lift"},
 )
 """Rewards by name, with options. A learned judge is the MODULE:NAME of a function of an outcome."""
 
@@ -84,7 +81,7 @@ def check_reward(reward: RewardFn, start: Start) -> None:
 
 
 def reward_of(reward: Any) -> RewardFn:
-    """Return a reward function, which a text names: `move_object --number 12 ...`, MODULE:NAME.
+    """Return a reward function, which a text names: `lift --height-m 0.1`, MODULE:NAME.
 
     Raises `InputError` for an unknown name, and for what is no function of the outcome.
     """

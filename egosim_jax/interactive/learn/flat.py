@@ -22,6 +22,9 @@ from egosim_jax.interactive.env.vector import StepReturn, WorldVectorEnv
 from egosim_jax.io.bounded import quote
 from egosim_jax.types import InputError
 
+MAX_STARTS = 256
+"""Maximum number of scenes that are kept, of about 2 MB each."""
+
 
 @runtime_checkable
 class Skill(RewardFn, Protocol):
@@ -68,6 +71,7 @@ class FlatVectorEnv(VectorWrapper):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._scene = np.zeros(self.num_envs, int)
+        self._starts: dict[int, dict[str, Any]] = {}
 
     def reset(
         self,
@@ -97,7 +101,10 @@ class FlatVectorEnv(VectorWrapper):
                 f"There are {len(drawn)} seeds for {self.num_envs} episodes: give one for each."
             )
         scene = np.where(mask, drawn, self._scene)
-        _, info = self.env.reset(seed=scene.tolist(), options={"reset_mask": mask})
+        starts = [self._start(int(number)) for number in scene]
+        _, info = self.env.reset(
+            seed=scene.tolist(), options={"reset_mask": mask, "starts": starts}
+        )
         self._scene = scene
         return self._observations(), {**info, "scene": self._scene.copy()}
 
@@ -120,6 +127,15 @@ class FlatVectorEnv(VectorWrapper):
         _, rewards, terminated, truncated, info = result
         about = {**info, "scene": self._scene.copy()}
         return self._observations(), rewards.astype(np.float32), terminated, truncated, about
+
+    def _start(self, seed: int) -> dict[str, Any]:
+        """Return the options of a scene, which are kept: a policy comes to a scene many times."""
+        if seed not in self._starts:
+            start = self.env.backend.start(seed, self.env.actions)
+            if len(self._starts) >= MAX_STARTS:
+                self._starts.pop(next(iter(self._starts)))
+            self._starts[seed] = {"start": start}
+        return self._starts[seed]
 
     def _observations(self) -> Float32[np.ndarray, "n o"]:
         seen = [self.skill.observe(running) for running in self.env.running]

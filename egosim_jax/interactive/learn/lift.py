@@ -7,7 +7,7 @@ to turn the hand. One clip is one episode.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, no_type_check
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -30,7 +30,6 @@ MAX_SIZE_M = 0.11
 """Largest extent of an object that a hand takes, in meters: furniture is larger."""
 
 
-@no_type_check
 @dataclass(frozen=True, kw_only=True)
 class Lift:
     """Lift the object that is nearest to the resting hand; it is also the reward."""
