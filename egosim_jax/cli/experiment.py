@@ -16,6 +16,7 @@ from egosim_jax.experiments.config import (
     RealTiny,
     Students,
     Tabletop,
+    TrainPolicy,
     Update,
 )
 from egosim_jax.runtime.command import ExitCode, group
@@ -30,6 +31,7 @@ KINDS = {
     "policies": Policies,
     "dwm": DWM,
     "rank": Rank,
+    "train_policy": TrainPolicy,
     "real_tiny": RealTiny,
     "debug": Debug,
 }

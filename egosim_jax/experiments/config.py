@@ -164,7 +164,8 @@ class LookAway(ModelExperiment):
 
     A hand moves the object in view, or out of view. The state is updated by the oracle, by
     classical perception, or not at all. Prints a table and the differences from no update. Writes
-    report.json and contact_sheet.png. The same command resumes an interrupted experiment.
+    report.json and contact_sheet.png, and in wrbench the videos as WRBench's evaluation reads them.
+    The same command resumes an interrupted experiment.
     """
 
     scenes: Count = 12
@@ -190,6 +191,41 @@ class Policies(ModelExperiment):
     """Perception pipeline that measures success in generated clips, with its options."""
     batch_size: Count = 5
     """Number of clips generated together."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainPolicy(Checked):
+    """Train a small policy in a generated world, and judge it in the true world.
+
+    A linear policy that lifts an object is fitted to poor demonstrations, improved by PPO of
+    Stable-Baselines3 or TorchRL, and judged before and after in other scenes. Prints success with
+    intervals. Writes report.json. The same command resumes after the training. Needs the extra rl.
+    """
+
+    out: Path
+    """Folder of the report."""
+    library: Literal["stable_baselines3", "torchrl"] = "stable_baselines3"
+    """Library whose PPO trains the policy, through its adapter of our environment."""
+    config: str = "preview"
+    """Name of the model whose world the policy is trained in; `preview` needs no weights."""
+    rounds: Count = 10
+    """Number of updates of PPO."""
+    steps: Count = 4
+    """Number of clips of each episode of the batch in an update."""
+    batch_size: Count = 8
+    """Number of episodes that are simulated together."""
+    demonstrations: Count = 10
+    """Number of demonstrations that the first policy is fitted to."""
+    scenes: Count = 32
+    """Number of scenes of the training."""
+    first_scene: Seed = 300
+    """Seed of the first scene of the training; the shipped model was trained on seeds from 1000."""
+    tests: Count = 24
+    """Number of scenes in which the policies are judged."""
+    first_test: Seed = 500
+    """Seed of the first of these scenes."""
+    seed: Seed = 0
+    """Seed of demonstrations and training."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,6 +7,7 @@ model and perception get no hand that is out of view; only the true world execut
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -19,8 +20,9 @@ from egosim_jax.evaluation.metrics import region
 from egosim_jax.evaluation.metrics.state_update import ON_SURFACE_M, distance_to_mesh
 from egosim_jax.experiments.config import LookAway
 from egosim_jax.experiments.continuous import METHODS, NOT_UPDATED, folder_name
-from egosim_jax.experiments.report import differences, show, summaries, write_report
+from egosim_jax.experiments.report import differences, share, show, summaries, write_report
 from egosim_jax.experiments.scenes import carrying
+from egosim_jax.experiments.wrbench import Record, write_manifest
 from egosim_jax.generation.generator import Generator
 from egosim_jax.geometry import invert, transform
 from egosim_jax.perception import registry
@@ -61,16 +63,18 @@ MEASURES = {
     "object_error": ("object error %", "{:.1f}"),
     "state_accuracy": ("state accuracy %", "{:.0f}"),
 }
+CASES_KEY = "seen, unseen"
 DEFINITIONS = {
     "kept": f"100 if the object is within {NEAR_PERCENT:g} % of the image's width of its true "
-    f"place in the last {FRAMES_BACK} frames, after looking back, else 0",
+    f"place in the last {FRAMES_BACK} frames, after looking back, else 0; in the table, the share "
+    "of scenes with Wilson's 95 % interval",
     "object_error": "distance between the object's centroid, segmented by color among the colors "
     "of all bodies, and the centroid of its ground-truth ids, in percent of the width, median over "
     "the same frames",
     "region_psnr": "dB over the pixels of these frames where the object is or was before the move",
     "state_accuracy": "share of the object's points in the last state within 1 cm of its true "
     "surface; 0 without points",
-    "seen, unseen": "the object is carried in view, or while the wearer looks elsewhere",
+    CASES_KEY: "the object is carried in view, or while the wearer looks elsewhere",
     "ground truth": "frames of the true world, which test the detection of the object, and the "
     "state by classical perception of them",
     "differences": "from no update, on the same scenes; mean and Student's 95 % interval",
@@ -91,6 +95,35 @@ class Story:
     """Pixels of the last frames that show the object at its initial position."""
     background: UInt8[np.ndarray, "f h w 3"]
     """Last frames without hands and without the object."""
+    degrees: float
+    """Turn of the head, positive to the left."""
+    caption: str
+    """What the hand does."""
+
+    def record(self, case: str, method: str, videos: Sequence[np.ndarray], fps: int) -> Record:
+        """Return the record of a video of each clip, for WRBench."""
+        cameras = [to_action(clip).cameras for clip in self.clips]
+        poses = [camera.world_from_camera for camera in cameras]
+        family = f"tabletop_{self.seed}"
+        return Record(
+            name=f"{family}_{case}_{folder_name(method)}",
+            frames=_joined(videos),
+            fps=fps,
+            world_from_camera=_joined(poses),
+            intrinsics_px=cameras[0].intrinsics_px,
+            degrees=self.degrees,
+            about={
+                "model": method,
+                "family_id": family,
+                "variant_id": f"{family}__{case}",
+                "prompt_id": f"{family}__{case}",
+                "event_delta": "spatial",
+                "scenario_type": case,
+                "world_state_prompt": self.caption,
+                "expected_state": f"After looking back, the {self.target} is where it was put.",
+                "expected_behavior": DEFINITIONS[CASES_KEY],
+            },
+        )
 
     def score(self, frames: UInt8[np.ndarray, "f h w 3"]) -> dict[str, float]:
         """Return every measure of a video of the last clip."""
@@ -125,14 +158,24 @@ def run(settings: LookAway) -> None:
     seeds = list(islice(outside, settings.scenes))
     jobs = [(case, seed) for case in CASES for seed in seeds]
     scores: dict[str, list[dict[str, float]]] = {}
+    records = []
     for case, seed in track(jobs, "scenes", total=len(jobs)):
         story = make_story(seed, spec, case)
+        videos = {TRUE: [clip.frames for clip in story.clips]}
         true = story.score(story.clips[-1].frames) | _perceive_true(story, spec)
         scores.setdefault(f"{case}: {TRUE}", []).append(true)
         for method in METHODS:
-            simulated = _simulate(story, generator, method, _folder(out, case, method, seed))
+            folder = _folder(out, case, method, seed)
+            simulated = _simulate(story, generator, method, folder)
             scores.setdefault(f"{case}: {method}", []).append(simulated)
+            videos[method] = _clips(folder, spec)
+        for method, clips in videos.items():
+            record = story.record(case, method, clips, spec.fps)
+            records.append(record.write(out / "wrbench"))
+    write_manifest(out / "wrbench", records)
     table, gaps = summaries(scores, MEASURES), {}
+    for name, values in scores.items():
+        table[name]["kept"] = share([bool(value["kept"]) for value in values])
     for case in CASES:
         by_method = {f"{case}: {method}": scores[f"{case}: {method}"] for method in METHODS}
         gaps |= differences(by_method, f"{case}: {NOT_UPDATED}", MEASURES)
@@ -144,9 +187,10 @@ def run(settings: LookAway) -> None:
         scores=scores,
         differences=gaps,
     )
-    show("after looking back: mean ± spread over scenes", table, MEASURES)
+    show("after looking back: mean ± spread over scenes, kept [95 %]", table, MEASURES)
     show("difference from no update, with its 95 % interval", gaps, MEASURES)
     _draw(out, seeds[:SHEET_SCENES], spec)
+    print_line(out / "wrbench" / "videos.json")
 
 
 def _folder(out: Path, case: str, method: str, seed: int) -> Path:
@@ -167,6 +211,17 @@ def _simulate(story: Story, generator: Generator, method: str, folder: Path) -> 
     )
     *_, last = steps
     return story.score(last.clip.frames) | story.score_state(last.state)
+
+
+def _clips(folder: Path, spec: VideoSpec) -> list[np.ndarray]:
+    """Return the frames of each clip of a simulation."""
+    paths = [folder / f"clip_{number}" / "frames.npz" for number in (1, 2, 3)]
+    return [load_clip(path, spec.fps).frames for path in paths]
+
+
+def _joined(clips: Sequence[np.ndarray]) -> np.ndarray:
+    """Return clips one after the other; the first frame of each is the last one before it."""
+    return np.concatenate([clips[0], *(clip[1:] for clip in clips[1:])])
 
 
 def _perceive_true(story: Story, spec: VideoSpec) -> dict[str, float]:
@@ -232,6 +287,8 @@ def make_story(seed: int, spec: VideoSpec, case: str) -> Story:
         background=np.stack(
             [p.colors for p in render_scenes([world.scene] * FRAMES_BACK, back, without=target)]
         ),
+        degrees=float(np.degrees(angle)),
+        caption=prompt,
     )
 
 
@@ -244,8 +301,7 @@ def _draw(out: Path, seeds: list[int], spec: VideoSpec) -> None:
             videos = {"ground truth, first clip": story.clips[0].frames}
             videos["ground truth"] = story.clips[-1].frames
             for method in METHODS:
-                frames = _folder(out, case, method, seed) / "clip_3" / "frames.npz"
-                videos[method] = load_clip(frames, spec.fps).frames
+                videos[method] = _clips(_folder(out, case, method, seed), spec)[-1]
             title = f"{case}, scene {seed}, last clip: {', '.join(videos)}"
             shown.append(SheetClip(title, list(videos.values())))
     moments = [0, spec.frames // 4, spec.frames // 2, 3 * spec.frames // 4, spec.frames - 1]

@@ -177,10 +177,14 @@ def _light(hands: MovingMesh, cameras: Cameras, depth_m: DepthMaps) -> DepthMaps
 
 
 def _window(hands: MovingMesh, cameras: Cameras) -> tuple[slice, slice]:
-    """Return the rows and columns that hands and their shadow can be in."""
+    """Return the rows and columns that hands and their shadow can be in.
+
+    They include the principal point, which cameras must have in their image.
+    """
     sizes = cameras.height, cameras.width
     full = slice(0, sizes[0]), slice(0, sizes[1])
-    low, high = [], []
+    low: list[np.ndarray] = []
+    high: list[np.ndarray] = []
     for pose, vertices in zip(cameras.world_from_camera, hands.vertices_m, strict=True):
         local = transform(invert(pose), vertices[np.isfinite(vertices).all(axis=1)])
         if not len(local):
@@ -193,6 +197,8 @@ def _window(hands: MovingMesh, cameras: Cameras) -> tuple[slice, slice]:
         high.append(pixels.max(axis=0) + margin)
     if not low:
         return slice(0, 0), slice(0, 0)
+    center = cameras.intrinsics_px[1::-1, 2]
+    low, high = [*low, center], [*high, center]
     first = np.clip(np.floor(np.min(low, axis=0)), 0, sizes).astype(int)
     last = np.clip(np.ceil(np.max(high, axis=0)) + 1, 0, sizes).astype(int)
     return slice(*map(int, (first[0], last[0]))), slice(*map(int, (first[1], last[1])))

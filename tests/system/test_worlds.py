@@ -7,6 +7,7 @@ import pytest
 
 from egosim_jax import configs
 from egosim_jax.cli.__main__ import main
+from egosim_jax.io.video import probe_video
 from egosim_jax.io.weights import STUDENT
 from egosim_jax.worlds.tabletop.policies import POLICIES
 
@@ -25,6 +26,12 @@ def test_looking_away_reports_each_case_and_method_and_resumes(weights, tmp_path
     assert report["table"]["unseen: no update"]["state_accuracy"]["mean"] < 20
     assert (out / "contact_sheet.png").exists()
     assert "after looking back" in capsys.readouterr().out
+    assert report["table"]["seen: update, oracle"]["kept"].keys() == {"mean", "low", "high"}
+    videos = json.loads((out / "wrbench" / "videos.json").read_text("utf-8"))
+    assert len(videos) == 2 * 4
+    clip = configs.get("debug").video.frames
+    assert {probe_video(out / "wrbench" / v["path"]).frames for v in videos} == {3 * clip - 2}
+    assert {v["model"] for v in videos} == methods
     kept = (out / "report.json").read_bytes()
     clips = {path: path.stat().st_mtime_ns for path in out.glob("*/*/*/clip_*/frames.npz")}
     assert len(clips) == 2 * 3 * 3

@@ -42,6 +42,7 @@ SCRIPT = re.compile(r"^    python (examples/\S+)", re.M)
 FENCE = re.compile(r"^```python\n(.*?)^```", re.M | re.S)
 FENCED = {
     "environments.md": "tests/unit/interactive/env/test_documented_script.py",
+    "policy_training.md": "tests/unit/interactive/learn/test_documented_training.py",
     "protocol.md": "tests/unit/interactive/server/test_documented_protocol.py",
     "serving.md": None,  # openpi-client needs numpy 1
     "streaming.md": None,  # names stand for your own model and policy

@@ -131,6 +131,7 @@ def make_vec(
 
 def _check_options(env: type, backend: Any, world: Any, options: Mapping[str, Any]) -> None:
     """Raise `InputError` for options that cannot be: a world takes long to load."""
+    from egosim_jax.interactive.env.rewards import reward_of
     from egosim_jax.interactive.env.single import check_settings
 
     if backend is not None and world is not None:
@@ -146,6 +147,8 @@ def _check_options(env: type, backend: Any, world: Any, options: Mapping[str, An
     check_settings(**{name: options[name] for name in checked if name in options})
     fields = [name for name in signature(env).parameters if name not in _POSITIONAL]
     allowed = ["backend", "world", *fields]
+    if isinstance(reward := options.get("reward"), str):
+        reward_of(reward)
     if unknown := [name for name in options if name not in allowed]:
         raise InputError(
             f"There is no option {unknown[0]!r:.40} of an environment.{meant(unknown[0], allowed)} "

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from egosim_jax.io.bounded import quote
+from egosim_jax.runtime.registry import Registry
 from egosim_jax.simulation.simulator import Step
 from egosim_jax.simulation.start import Start
 from egosim_jax.types import InputError, SceneState, check_video
@@ -54,6 +55,15 @@ class RewardFn(Protocol):
         ...
 
 
+REWARDS: Registry[RewardFn] = Registry(
+    "reward",
+    "reward",
+    "egosim_jax.rewards",
+    {"lift": "egosim_jax.interactive.learn.lift:Lift"},
+)
+"""Rewards by name, with options. A learned judge is the MODULE:NAME of a function of an outcome."""
+
+
 def check_object(first: SceneState, number: int) -> None:
     """Raise `InputError` unless the first state of an episode has points of an object."""
     objects = set(np.unique(first.object_ids).tolist()) - {0}
@@ -70,13 +80,23 @@ def check_reward(reward: RewardFn, start: Start) -> None:
         check(start)
 
 
-def check_callable(reward: Any) -> None:
-    """Raise `InputError` unless a reward is a function of the outcome."""
+def reward_of(reward: Any) -> RewardFn:
+    """Return a reward function, which a text names: `lift --height-m 0.1`, MODULE:NAME.
+
+    Raises `InputError` for an unknown name, and for what is no function of the outcome.
+    """
+    given = reward
+    if isinstance(reward, str):
+        name = reward.split(maxsplit=1)[0] if reward.strip() else ""
+        named = REWARDS.get(name)
+        # a function of an outcome is a reward; only a class is made, with the options
+        reward = REWARDS.parse(reward) if isinstance(named, type) or reward != name else named
     if not callable(reward):
         raise InputError(
-            f"The reward is {quote(reward)}: it must be MoveObject, GoalImage or a function of an "
-            "Outcome that returns a Reward. (reward)"
+            f"The reward is {quote(given)}: it must be MoveObject, GoalImage, a function of an "
+            "Outcome that returns a Reward, or the MODULE:NAME of one. (reward)"
         )
+    return reward
 
 
 def judge(reward: RewardFn, outcome: Outcome) -> Reward:

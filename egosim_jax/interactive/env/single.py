@@ -32,10 +32,10 @@ from egosim_jax.interactive.env.rewards import (
     Outcome,
     Reward,
     RewardFn,
-    check_callable,
     check_reward,
     judge,
     no_reward,
+    reward_of,
 )
 from egosim_jax.interactive.env.validity import validity
 from egosim_jax.io.bounded import quote
@@ -290,7 +290,7 @@ class WorldEnv(gymnasium.Env):
         *,
         actions: ActionSpec | None = None,
         observe: tuple[str, ...] = ("frames",),
-        reward: RewardFn = no_reward,
+        reward: RewardFn | str = no_reward,
         max_chunks: int = 10,
         render_mode: str | None = None,
     ):
@@ -303,11 +303,11 @@ class WorldEnv(gymnasium.Env):
         self.backend, self.actions = backend, actions or ActionSpec()
         self.metadata = {**self.metadata, "render_fps": backend.video.fps}
         self.render_mode = render_mode
-        self._observe, self._reward, self._max_chunks = tuple(observe), reward, max_chunks
+        self._observe, self._max_chunks = tuple(observe), max_chunks
+        self._reward = reward_of(reward)
         low, high = self.actions.bounds
         self.action_space = spaces.Box(low, high, dtype=np.float64)
         self.observation_space = observation_space(backend.video, self.actions, self._observe)
-        check_callable(reward)
         self._running: RunningEpisode | None = None
         self._open: OpenStep | None = None
         self._closed = False

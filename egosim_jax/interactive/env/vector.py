@@ -17,9 +17,9 @@ from egosim_jax.interactive.env.backends import Backend
 from egosim_jax.interactive.env.chunks import straight_path
 from egosim_jax.interactive.env.rewards import (
     RewardFn,
-    check_callable,
     check_reward,
     no_reward,
+    reward_of,
 )
 from egosim_jax.interactive.env.single import (
     CLOSED,
@@ -57,6 +57,8 @@ class WorldVectorEnv(VectorEnv):
         "render_modes": [],
         "autoreset_mode": AutoresetMode.DISABLED,
     }
+    autoreset_mode = AutoresetMode.DISABLED
+    """Mode of `metadata`, where TorchRL looks for it."""
 
     def __init__(
         self,
@@ -65,20 +67,20 @@ class WorldVectorEnv(VectorEnv):
         *,
         actions: ActionSpec | None = None,
         observe: tuple[str, ...] = ("frames",),
-        reward: RewardFn | Sequence[RewardFn] = no_reward,
+        reward: RewardFn | str | Sequence[RewardFn | str] = no_reward,
         max_chunks: int = 10,
     ):
         check_counts({"num_envs": num_envs})
         check_settings(actions=actions, observe=observe, max_chunks=max_chunks)
         self.num_envs, self.backend, self.actions = num_envs, backend, actions or ActionSpec()
         self._observe, self._max_chunks = tuple(observe), max_chunks
-        self._rewards = [reward] * num_envs if callable(reward) else list(reward)
-        if len(self._rewards) != num_envs:
+        single = callable(reward) or isinstance(reward, str)
+        given = [reward] * num_envs if single else list(reward)
+        if len(given) != num_envs:
             raise InputError(
-                f"{len(self._rewards)} rewards for {num_envs} episodes: give one, or one for each."
+                f"{len(given)} rewards for {num_envs} episodes: give one, or one for each."
             )
-        for given in self._rewards:
-            check_callable(given)
+        self._rewards = [reward_of(one) for one in given]
         low, high = self.actions.bounds
         self.single_action_space = spaces.Box(low, high, dtype=np.float64)
         self.action_space = batch_space(self.single_action_space, num_envs)

@@ -120,3 +120,12 @@ def test_the_simulator_predicts_what_it_shows_and_streams_groups():
     step = simulator.step(state, action(), seed=0)
     assert [len(group) for group in shown] == [4, 2]
     np.testing.assert_array_equal(step.clip.frames, make(step.view, action()))
+
+
+def test_a_hand_at_one_side_of_the_image_is_drawn():
+    """Its window has no principal point of its own."""
+    acted = action()
+    aside = replace(acted, joints_m=acted.joints_m * 0.5 + [0.25, 0.1, 0.6])
+    drawn = is_drawn(make(view(depth_m=2.0), aside))
+    assert drawn.any(axis=0)[:, SPEC.width // 2 :].sum() > 50
+    assert not drawn[..., : SPEC.width // 2].any()
