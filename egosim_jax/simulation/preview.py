@@ -78,7 +78,7 @@ class Preview:
 
 def draw(view: View, hands: MovingMesh, cameras: Cameras) -> Video:
     """Return a view without holes, with shaded hands where no point of it is nearer."""
-    frames = np.stack([fill_holes(*images) for images in zip(*_seen(view), strict=True)])
+    frames = without_holes(view)
     rows, columns = _window(hands, cameras)
     if rows.start >= rows.stop or columns.start >= columns.stop:
         return frames
@@ -95,6 +95,11 @@ def draw(view: View, hands: MovingMesh, cameras: Cameras) -> Video:
     share = reduce(front.astype(np.float32), size, "mean", **parts)
     frames[window] = np.round(drawn + shaded * (1 - share))
     return frames
+
+
+def without_holes(view: View) -> Video:
+    """Return the frames of a view; what no point shows is filled from around it."""
+    return np.stack([fill_holes(*images) for images in zip(*_seen(view), strict=True)])
 
 
 def mesh_of(action: Action) -> MovingMesh:

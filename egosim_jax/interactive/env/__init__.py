@@ -111,7 +111,8 @@ def make(*, backend: Backend | None = None, world: World | None = None, **option
     from egosim_jax.interactive.env.single import WorldEnv
 
     _check_options(WorldEnv, backend, world, options)
-    return WorldEnv(backend or load_backend(world or "generated"), **options)
+    batch = 1 + _observed_cameras(options)
+    return WorldEnv(backend or load_backend(world or "generated", batch=batch), **options)
 
 
 def make_vec(
@@ -125,8 +126,16 @@ def make_vec(
     from egosim_jax.interactive.env.vector import WorldVectorEnv
 
     _check_options(WorldVectorEnv, backend, world, options)
-    chosen = backend or load_backend(world or "generated", batch=num_envs)
+    batch = num_envs * (1 + _observed_cameras(options))
+    chosen = backend or load_backend(world or "generated", batch=batch)
     return WorldVectorEnv(chosen, num_envs, **options)
+
+
+def _observed_cameras(options: Mapping[str, Any]) -> int:
+    """Return the number of further cameras that have clips."""
+    from egosim_jax.interactive.env.observing import observed
+
+    return len(observed(options.get("cameras", ()), options.get("observe", ())))
 
 
 def _check_options(env: type, backend: Any, world: Any, options: Mapping[str, Any]) -> None:
@@ -142,7 +151,7 @@ def _check_options(env: type, backend: Any, world: Any, options: Mapping[str, An
         )
     if isinstance(backend, str):
         raise InputError(f"The backend is {backend!r:.40}: name a world by world=.")
-    checked = ("actions", "observe", "max_chunks")
+    checked = ("actions", "observe", "max_chunks", "cameras")
     check_settings(**{name: options[name] for name in checked if name in options})
     fields = [name for name in signature(env).parameters if name not in _POSITIONAL]
     allowed = ["backend", "world", *fields]

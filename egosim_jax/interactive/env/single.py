@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, SupportsIndex, cast
@@ -17,7 +17,6 @@ from jaxtyping import Float, UInt8
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import Backend, preview_info
 from egosim_jax.interactive.env.chunks import (
-    OBSERVATIONS,
     STATE_FIELDS,
     Chunk,
     last_camera,
@@ -26,6 +25,12 @@ from egosim_jax.interactive.env.chunks import (
     straight_path,
     timed_step,
     view_of,
+)
+from egosim_jax.interactive.env.observing import (
+    Observer,
+    check_observe,
+    observed,
+    unobserved_info,
 )
 from egosim_jax.interactive.env.parts import OpenStep, part_rows
 from egosim_jax.interactive.env.rewards import (
@@ -41,6 +46,7 @@ from egosim_jax.interactive.env.validity import validity
 from egosim_jax.io.bounded import quote
 from egosim_jax.runtime.phases import phase, show_phases
 from egosim_jax.simulation.episode import Episode
+from egosim_jax.simulation.rig import MountedCamera, check_cameras
 from egosim_jax.simulation.simulator import Step
 from egosim_jax.simulation.start import Start, check_size
 from egosim_jax.state import snapshot
@@ -55,7 +61,9 @@ OPTIONS = ("start", "episode", "state", "prompt")
 CLOSED = "The environment is closed: make a new one."
 
 
-def check_settings(*, actions: Any = None, observe: Any = (), max_chunks: Any = 1) -> None:
+def check_settings(
+    *, actions: Any = None, observe: Any = (), max_chunks: Any = 1, cameras: Any = ()
+) -> None:
     """Raise `InputError` for settings that an environment cannot have."""
     if isinstance(observe, str):
         raise InputError(
@@ -70,14 +78,11 @@ def check_settings(*, actions: Any = None, observe: Any = (), max_chunks: Any = 
         raise InputError(
             f"max_chunks is {max_chunks!r:.40}: it must be a whole number of at least 1."
         )
+    check_observe(observe, check_cameras(cameras, (actions or ActionSpec()).sides))
 
 
 def observation_space(video: VideoSpec, spec: ActionSpec, observe: tuple[str, ...]) -> spaces.Dict:
-    """Return the space of the row and the requested observations."""
-    if unknown := [name for name in observe if name not in OBSERVATIONS]:
-        raise InputError(
-            f"There is no observation {unknown[0]!r:.40}: choose from {', '.join(OBSERVATIONS)}."
-        )
+    """Return the space of the row and the requested observations, also of further cameras."""
     size = (video.height, video.width)
     low, high = spec.bounds
     keypoints = (len(spec.sides), 21 if spec.kind == "human" else 3, 3)
@@ -94,7 +99,7 @@ def observation_space(video: VideoSpec, spec: ActionSpec, observe: tuple[str, ..
         ),
     }
     row = spaces.Box(low, high, dtype=np.float64)
-    return spaces.Dict({"row": row, **{name: by_name[name] for name in observe}})
+    return spaces.Dict({"row": row, **{name: by_name[name.split(".")[-1]] for name in observe}})
 
 
 def start_from_options(
@@ -177,8 +182,11 @@ class RunningEpisode:
         *,
         reward: RewardFn,
         max_chunks: int,
+        cameras: tuple[MountedCamera, ...] = (),
     ):
         self.backend, self.actions, self.start, self.now = backend, actions, start, start
+        self.observer = Observer(backend=backend, actions=actions, cameras=cameras)
+        self._first_frames = self.observer.first_frames(start)
         self._reward, self._max_chunks, self.ended = reward, max_chunks, False
         self.camera = start.camera
         self.last: Step | None = None
@@ -207,7 +215,7 @@ class RunningEpisode:
         """Return the step of a chunk and its metadata, without changing the episode."""
         now = self.now
         step, timing = timed_step(
-            self.backend.simulator(now),
+            self.observer.on(self.backend.simulator(now), chunk.rows),
             now.state,
             chunk.action,
             seed=now.seed + now.steps + 1,
@@ -217,7 +225,7 @@ class RunningEpisode:
 
     def open(self, prompt: str | None) -> OpenStep:
         """Begin the next step, whose rows are given part by part."""
-        return OpenStep(self.backend, self.actions, self.now, prompt)
+        return OpenStep(self.backend, self.actions, self.now, prompt, self.observer)
 
     def facts(self, chunk: Chunk, step: Step) -> dict[str, Any]:
         """Return the metadata of a step of a chunk."""
@@ -228,6 +236,7 @@ class RunningEpisode:
             **preview_info(simulator.generator),
             "notes": list(step.notes),
             **validity(now.state, step, chunk.action, simulator.renderer),
+            **unobserved_info(step),
         }
 
     def judged(self, step: Step) -> Reward:
@@ -259,6 +268,12 @@ class RunningEpisode:
             first = self._view().frames[0]
         return np.repeat(first[None], self.backend.video.frames, axis=0)
 
+    def frames_of(self, camera: str) -> UInt8[np.ndarray, "f h w 3"]:
+        """Return what `frames` does, as a further camera sees it."""
+        if self.last is not None:
+            return self.last.others[camera].clip.frames
+        return np.repeat(self._first_frames[camera][None], self.backend.video.frames, axis=0)
+
     def _view(self) -> View:
         return view_of(self.backend.simulator(self.now), self.now.state, self.camera)
 
@@ -269,6 +284,14 @@ class RunningEpisode:
             seen["frames"] = self.frames().copy()
         if "depth" in observe:
             seen["depth"] = np.minimum(self._view().depth_m[0], np.float32(FAR_M))
+        for name in observe:
+            camera, _, what = name.partition(".")
+            if what == "frames":
+                seen[name] = self.frames_of(camera).copy()
+            elif what:
+                now = self.now
+                depth = self.observer.depth(camera, now, now.state, self.camera, self.row)
+                seen[name] = np.minimum(depth, np.float32(FAR_M))
         if "keypoints" in observe:
             seen["keypoints"] = self.actions.joints(self.row[None])[0].copy()
         if "state" in observe:
@@ -293,8 +316,9 @@ class WorldEnv(gymnasium.Env):
         reward: RewardFn = no_reward,
         max_chunks: int = 10,
         render_mode: str | None = None,
+        cameras: Sequence[MountedCamera] = (),
     ):
-        check_settings(actions=actions, observe=observe, max_chunks=max_chunks)
+        check_settings(actions=actions, observe=observe, max_chunks=max_chunks, cameras=cameras)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InputError(
                 f"render_mode is {render_mode!r:.40}: it must be 'rgb_array' or None. The page of "
@@ -304,6 +328,7 @@ class WorldEnv(gymnasium.Env):
         self.metadata = {**self.metadata, "render_fps": backend.video.fps}
         self.render_mode = render_mode
         self._observe, self._reward, self._max_chunks = tuple(observe), reward, max_chunks
+        self._cameras = observed(cameras, observe)
         low, high = self.actions.bounds
         self.action_space = spaces.Box(low, high, dtype=np.float64)
         self.observation_space = observation_space(backend.video, self.actions, self._observe)
@@ -340,7 +365,8 @@ class WorldEnv(gymnasium.Env):
         with show_phases(), phase("makes the scene", only_if_long=True):
             start = start_from_options(self.backend, self.actions, seed=chosen, options=options)
         check_reward(self._reward, start)
-        limits = {"reward": self._reward, "max_chunks": self._max_chunks}
+        limits: dict[str, Any] = {"reward": self._reward, "max_chunks": self._max_chunks}
+        limits["cameras"] = self._cameras
         self._running = RunningEpisode(self.backend, self.actions, start, **limits)
         self._open = None
         return self.running.observation(self._observe), self.running.info()
@@ -392,6 +418,11 @@ class WorldEnv(gymnasium.Env):
             if "frames" in seen:
                 missing = self.backend.video.frames - len(step.frames)
                 seen["frames"] = np.pad(step.frames, ((0, missing), *[(0, 0)] * 3), mode="edge")
+            for camera in self._cameras:
+                if (name := f"{camera.name}.frames") in seen:
+                    frames = step.frames_of(camera.name)
+                    missing = self.backend.video.frames - len(frames)
+                    seen[name] = np.pad(frames, ((0, missing), *[(0, 0)] * 3), mode="edge")
             seen["row"] = step.row.copy()
             if "keypoints" in seen:
                 seen["keypoints"] = self.actions.joints(step.row[None])[0]
