@@ -200,6 +200,10 @@ def _window(hands: MovingMesh, cameras: Cameras) -> tuple[slice, slice]:
         return slice(0, 0), slice(0, 0)
     first = np.clip(np.floor(np.min(low, axis=0)), 0, sizes).astype(int)
     last = np.clip(np.ceil(np.max(high, axis=0)) + 1, 0, sizes).astype(int)
+    if (first < last).all():  # the principal point of `Cameras` is inside the image
+        middle = np.clip(cameras.intrinsics_px[[1, 0], 2], 0, np.array(sizes) - 1)
+        first = np.minimum(first, np.floor(middle).astype(int))
+        last = np.maximum(last, np.ceil(middle).astype(int) + 1)
     return slice(*map(int, (first[0], last[0]))), slice(*map(int, (first[1], last[1])))
 
 
