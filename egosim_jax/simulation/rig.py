@@ -107,7 +107,8 @@ class MountedCamera:
                 f"Camera {self.name} has the {field} {quote(getattr(self, field))}: it must be "
                 f"{size} rows of {size} finite numbers. (cameras)"
             )
-        return tuple(tuple(row) for row in matrix.tolist())
+        rows: Any = matrix.tolist()
+        return tuple(tuple(row) for row in rows)
 
     @property
     def side(self) -> Side | None:
@@ -168,8 +169,9 @@ def _listed(value: Any) -> Any:
 
 def check_cameras(cameras: Any, sides: Sequence[Side]) -> tuple[MountedCamera, ...]:
     """Return cameras as a tuple. Raises `InputError` unless they fit together and the hands."""
-    listed = tuple(cameras) if isinstance(cameras, list | tuple) else (None,)
-    if not all(isinstance(camera, MountedCamera) for camera in listed):
+    given = isinstance(cameras, list | tuple)
+    listed: tuple[MountedCamera, ...] = tuple(cameras) if given else ()
+    if not given or not all(isinstance(camera, MountedCamera) for camera in listed):
         raise InputError(
             f"cameras is {quote(cameras)}: it must be a list of MountedCamera. (cameras)"
         )

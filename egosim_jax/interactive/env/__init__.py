@@ -133,7 +133,7 @@ def make_vec(
 
 def _observed_cameras(options: Mapping[str, Any]) -> int:
     """Return the number of further cameras that have clips."""
-    from egosim_jax.interactive.env.observing import observed
+    from egosim_jax.interactive.env.chunks import observed
 
     return len(observed(options.get("cameras", ()), options.get("observe", ())))
 

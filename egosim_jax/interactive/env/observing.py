@@ -1,8 +1,7 @@
-"""Further cameras of an episode: names of their observations, clips, first frames and depth."""
+"""Further cameras of an episode: their clips, first frames and depth."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,36 +10,11 @@ from jaxtyping import Float, Float32, UInt8
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import Backend
-from egosim_jax.interactive.env.chunks import OBSERVATIONS
-from egosim_jax.io.bounded import quote
 from egosim_jax.simulation.rig import MountedCamera, Rig, check_cameras
 from egosim_jax.simulation.simulator import Simulator, Step
 from egosim_jax.simulation.start import Start
 from egosim_jax.simulation.views import view_from
 from egosim_jax.types import Cameras, InputError, SceneState, View
-
-OF_CAMERA = ("frames", "depth")
-"""Observations of a further camera, after its name and a dot."""
-
-
-def observation_names(cameras: Iterable[MountedCamera]) -> tuple[str, ...]:
-    """Return the names of all observations."""
-    return OBSERVATIONS + tuple(f"{c.name}.{name}" for c in cameras for name in OF_CAMERA)
-
-
-def check_observe(observe: Iterable[Any], cameras: Iterable[MountedCamera]) -> None:
-    """Raise `InputError` at the first name that is no observation."""
-    names = observation_names(cameras)
-    if unknown := [name for name in observe if name not in names]:
-        raise InputError(
-            f"There is no observation {quote(unknown[0])}: choose from {', '.join(names)}."
-        )
-
-
-def observed(cameras: Iterable[MountedCamera], observe: Iterable[str]) -> tuple[MountedCamera, ...]:
-    """Return the cameras of which something is observed."""
-    names = {name.partition(".")[0] for name in observe if "." in name}
-    return tuple(camera for camera in cameras if camera.name in names)
 
 
 def unobserved_info(step: Step) -> dict[str, Any]:

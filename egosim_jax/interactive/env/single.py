@@ -19,19 +19,16 @@ from egosim_jax.interactive.env.backends import Backend, preview_info
 from egosim_jax.interactive.env.chunks import (
     STATE_FIELDS,
     Chunk,
+    check_observe,
     last_camera,
     make_chunk,
+    observed,
     state_info,
     straight_path,
     timed_step,
     view_of,
 )
-from egosim_jax.interactive.env.observing import (
-    Observer,
-    check_observe,
-    observed,
-    unobserved_info,
-)
+from egosim_jax.interactive.env.observing import Observer, unobserved_info
 from egosim_jax.interactive.env.parts import OpenStep, part_rows
 from egosim_jax.interactive.env.rewards import (
     Outcome,

@@ -14,8 +14,7 @@ from jaxtyping import Bool, Float
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import Backend
-from egosim_jax.interactive.env.chunks import straight_path
-from egosim_jax.interactive.env.observing import observed
+from egosim_jax.interactive.env.chunks import observed, straight_path
 from egosim_jax.interactive.env.rewards import (
     RewardFn,
     check_callable,

@@ -4,27 +4,17 @@ import gymnasium
 import numpy as np
 import pytest
 
-from egosim_jax.geometry import look_at
 from egosim_jax.interactive import env as egosim
 from egosim_jax.interactive.env import load_backend
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.vector import WorldVectorEnv
 from egosim_jax.simulation.rig import MountedCamera
 from egosim_jax.types import InputError, VideoSpec
+from tests import painted as painting
 from tests.painted import VIDEO, painted
 
-UP = np.array([0, 0, 1.0])
-SIDE = MountedCamera(
-    name="side",
-    mount="world",
-    pose=look_at(np.array([0.45, 0.05, 0.42]), np.array([0, 0.275, 0.03]), up=UP),
-)
-WRIST = MountedCamera(
-    name="wrist",
-    mount="right_wrist",
-    pose=look_at(np.array([0, -0.06, 0.08]), np.array([0, 0.2, -0.04]), up=UP),
-    field_of_view_deg=90,
-)
+SIDE = MountedCamera(name="side", mount="world", pose=painting.SIDE)
+WRIST = MountedCamera(name="wrist", mount="right_wrist", pose=painting.WRIST, field_of_view_deg=90)
 HEAD = MountedCamera(name="same", mount="head", pose=np.eye(4))
 OBSERVE = ("frames", "wrist.frames", "wrist.depth", "side.frames", "same.frames")
 
