@@ -29,10 +29,11 @@ import cv2
 import numpy as np
 
 from egosim_jax.geometry import invert, pixel_rays, project, transform
-from egosim_jax.interactive.env import load_backend
+from egosim_jax.interactive.env import ActionSpec, load_backend
+from egosim_jax.rendering.mesh import Side
 from egosim_jax.rendering.skeleton import NEAR_M
 from egosim_jax.simulation.actions import all_joints_of, with_all_joints
-from egosim_jax.simulation.rig import MountedCamera, Rig
+from egosim_jax.simulation.rig import Mount, MountedCamera, Rig
 from egosim_jax.simulation.simulator import Simulator
 from egosim_jax.types import Action, Cameras, InputError, SceneState, VideoSpec, seen_hands
 from egosim_jax.worlds.tabletop import make_scripts
@@ -137,13 +138,11 @@ def rig_of(mount: str, action: Action) -> Rig:
     """Return a rig of the second camera."""
     sides = sides_of(all_joints_of(action), "human")
     hand = int(np.ptp(all_joints_of(action)[:, :, 0], axis=0).max(axis=-1).argmax())
-    camera = (
-        MountedCamera(name="other", mount="world", pose=SIDE)
-        if mount == "world"
-        else MountedCamera(
-            name="other", mount=f"{sides[hand]}_wrist", pose=WRIST, field_of_view_deg=90
-        )
-    )
+    on_wrist: dict[Side, Mount] = {"left": "left_wrist", "right": "right_wrist"}
+    camera = MountedCamera(name="other", mount="world", pose=SIDE)
+    if mount == "wrist":
+        place = on_wrist[sides[hand]]
+        camera = MountedCamera(name="other", mount=place, pose=WRIST, field_of_view_deg=90)
     return Rig(cameras=(camera,), sides=sides)
 
 
@@ -212,12 +211,12 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=40_000)
     parser.add_argument("--clips", type=int, default=2)
     parser.add_argument("--steps", type=int)
+    parser.add_argument("--mounts", nargs="+", default=["world", "wrist"])
     parser.add_argument("--exact", action="store_true", help="surfaces of the true world")
     args = parser.parse_args()
     backend = load_backend(config=args.config, steps=args.steps, compile=False, batch=2)
-    seed_start = backend.start(args.first, _spec())
-    simulator = backend.simulator(seed_start)
-    for mount in ("world", "wrist"):
+    simulator = backend.simulator(backend.start(args.first, ActionSpec()))
+    for mount in args.mounts:
         rows, seed = [], args.first
         while len(rows) < args.scenes:
             try:
@@ -227,12 +226,6 @@ def main() -> None:
                 print(mount, seed, "skipped:", error, flush=True)
             seed += 1
         report(mount, np.array(rows))
-
-
-def _spec() -> Any:
-    from egosim_jax.interactive.env.action_spec import ActionSpec
-
-    return ActionSpec()
 
 
 def report(mount: str, values: np.ndarray) -> None:

@@ -9,6 +9,7 @@ new frame of a clip. Sessions of remote clients are in `server`. Needs the extra
 - `make`, `make_vec`: one environment, or several as a batch.
 - `load_backend`: the world behind an environment.
 - `ActionSpec`: layout and bounds of action rows.
+- `MountedCamera`: further camera, fixed in the world, on the head or on a wrist.
 - `Start`: scene, camera and hands from which an episode continues.
 - `rewards`: `Reward`, `MoveObject`, `GoalImage`.
 """
@@ -24,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.runtime.options import meant
 from egosim_jax.runtime.phases import phase, show_phases
+from egosim_jax.simulation.rig import MountedCamera
 from egosim_jax.simulation.start import Start
 from egosim_jax.types import InputError
 
@@ -33,7 +35,15 @@ if TYPE_CHECKING:
     from egosim_jax.interactive.env.vector import WorldVectorEnv
     from egosim_jax.simulation.episode import Episode
 
-__all__ = ["ActionSpec", "Start", "load_backend", "make", "make_vec", "register"]
+__all__ = [
+    "ActionSpec",
+    "MountedCamera",
+    "Start",
+    "load_backend",
+    "make",
+    "make_vec",
+    "register",
+]
 
 ID = "egosim_jax/Tabletop-v0"
 World = Literal["generated", "true"]
