@@ -24,7 +24,7 @@ from egosim_jax.types import VideoSpec
 VIDEO = VideoSpec(frames=5, height=32, width=48, fps=8)
 UP = np.array([0.0, 0.0, 1.0])
 SIDE = look_at(np.array([0.45, 0.05, 0.42]), np.array([0.0, 0.275, 0.03]), up=UP)
-"""Pose in the world of a camera beside the table."""
+"""Pose in the world of a camera next to the table."""
 WRIST = look_at(np.array([0.0, -0.06, 0.08]), np.array([0.0, 0.2, -0.04]), up=UP)
 """Pose on a wrist of a camera that looks along the fingers."""
 

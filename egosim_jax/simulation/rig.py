@@ -4,7 +4,7 @@
     simulator = replace(simulator, rig=Rig(cameras=(wrist,)))
     simulator.step(state, action, seed=1).others["wrist"].clip
 
-The axes of a wrist are those of an action's row: the origin is keypoint 0, y is along the fingers
+A wrist has the axes of an action's row: the origin is keypoint 0, y is along the fingers
 and z out of the back of the hand; a gripper opens along x. All cameras see the same state and the
 same predicted motion, so their clips agree. Their frames have the size of the main camera's.
 """
@@ -56,7 +56,7 @@ class MountedCamera:
     field_of_view_deg: float | None = None
     """Horizontal field of view in degrees, with the principal point in the middle."""
     intrinsics_px: Matrix | np.ndarray | None = None
-    """Intrinsics 3x3 in pixels of a frame; without either, those of the main camera."""
+    """Intrinsics 3x3 in pixels of a frame; without either, the lens of the main camera."""
 
     def __post_init__(self) -> None:
         """Convert arrays to tuples. Raises `InputError` for a name, mount, pose or lens."""

@@ -2,18 +2,18 @@
 
     python -m tests.benchmarks.bench_views [--config preview] [--scenes 8] [--clips 2]
 
-The head's camera, with its own loop, is in all rows. The second camera is fixed beside the table or
-is on a wrist. Its clips are made
+The camera of the head, with its own loop, is in all rows. The second camera is fixed next to the
+table or is on a wrist. Its clips are made
 
     one state     from the state of the head's camera and the motion predicted in it
-    independent   in a loop of their own: the state of the camera's own first frame with its true
-                  depth, its own prediction, perception and updates; the hands are the true ones
-    truth         by the tabletop world, which shows what the resampling costs
+    independent   in a separate loop: the state of the camera's first frame with its true depth, a
+                  separate prediction, perception and updates; the hands are the true ones
+    true world    by the tabletop world, which shows the cost of the resampling
 
 A pixel of one camera is compared with the other camera's image of the same surface, in both
 directions: the surface is at the depth that the clip's own view has there. Pixels on hands, behind
 what the other camera shows, and where it observed nothing do not count. With `--exact` the surfaces
-are those of the true world, for all rows. The table has the PSNR over all pixels, and over those on
+come from the true world, for all rows. The table has the PSNR over all pixels, and over those on
 objects that move. It is the mean over scenes, each the PSNR of all its clips, with the standard
 error of the difference from `independent`.
 """
@@ -47,7 +47,7 @@ SAME_M = 0.01
 """Maximum difference of true depths at which two pixels show one surface, in meters."""
 MOVED_M = 0.01
 """Motion of an object that counts as moved, in meters."""
-MADE = ("one state", "independent", "truth")
+MADE = ("one state", "independent", "true world")
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Look:
     ids: np.ndarray
     """Object of each pixel, `f h w`."""
     hands: np.ndarray
-    """Pixels of hands and arms in the true clip, and around them, `f h w`."""
+    """Pixels of hands and arms in the true world, and around them, `f h w`."""
 
 
 def look(clip: Any, view: Any, truth: TabletopClip) -> Look:
@@ -195,7 +195,7 @@ def measure(
 
 
 def moved_in(clip: TabletopClip) -> list[int]:
-    """Return the ids of the objects that move in a true clip."""
+    """Return the ids of the objects that move in a clip."""
     return [
         clip.body_ids[name]
         for name, path in clip.world_from_body.items()

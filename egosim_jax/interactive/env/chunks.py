@@ -84,7 +84,7 @@ def check_observe(observe: Iterable[Any], cameras: Iterable[MountedCamera]) -> N
 
 
 def observed(cameras: Iterable[MountedCamera], observe: Iterable[str]) -> tuple[MountedCamera, ...]:
-    """Return the cameras of which something is observed."""
+    """Return the cameras that an observation names."""
     names = {name.partition(".")[0] for name in observe if "." in name}
     return tuple(camera for camera in cameras if camera.name in names)
 

@@ -55,6 +55,8 @@ class Observer:
 
         Raises `InputError` if a camera on the head or in the world sees no point of the state.
         """
+        if not self.cameras:
+            return {}
         frames = {}
         row = self.actions.rest if start.row is None else start.row
         main = self.actions.cameras_of(row[None], start.camera)
