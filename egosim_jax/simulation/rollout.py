@@ -18,7 +18,7 @@ import numpy as np
 from egosim_jax.io.atomic import atomic_write, lock_folder
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.journal import Journal
-from egosim_jax.io.untrusted.npz import read_arrays
+from egosim_jax.io.untrusted.npz import DAMAGE, array_names, read_arrays
 from egosim_jax.perception import archive
 from egosim_jax.runtime.phases import phase
 from egosim_jax.runtime.terminal import counted
@@ -150,8 +150,12 @@ def _save_frames(path: Path, made: Made) -> None:
 
 
 def load_clip(path: Path, fps: int) -> Clip:
-    """Read the clip of a step from its frames.npz."""
-    return load_clips(path, fps, ())[0]
+    """Read the main camera's clip of a step from its frames.npz."""
+    try:
+        others = [name for name in array_names(path) if name != "frames"]
+    except DAMAGE:
+        others = []  # the next line then says what is damaged
+    return Clip(frames=read_arrays(path, {"frames": "uint8"}, others=others)["frames"], fps=fps)
 
 
 def load_clips(path: Path, fps: int, names: Sequence[str]) -> tuple[Clip, dict[str, Seen]]:

@@ -9,7 +9,7 @@ from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.rendering import reference
 from egosim_jax.simulation.preview import Preview
 from egosim_jax.simulation.rig import MountedCamera, Rig
-from egosim_jax.simulation.rollout import Rollout
+from egosim_jax.simulation.rollout import Rollout, load_clip
 from egosim_jax.simulation.simulator import Simulator
 from egosim_jax.simulation.views import view_from
 from egosim_jax.types import InputError
@@ -72,6 +72,8 @@ def test_a_rollout_keeps_the_clips_of_all_cameras(start, action, tmp_path):
         made.others["other"].clip.frames, kept.others["other"].clip.frames
     )
     assert made.others["other"].unobserved == kept.others["other"].unobserved
+    main = load_clip(tmp_path / "clip_1" / "frames.npz", fps=8)
+    np.testing.assert_array_equal(main.frames, made.clip.frames)
     with pytest.raises(InputError, match="cameras"):
         run(rig(np.eye(4), "head"))
 
