@@ -154,7 +154,7 @@ def load_clip(path: Path, fps: int) -> Clip:
     try:
         others = [name for name in array_names(path) if name != "frames"]
     except DAMAGE:
-        others = []  # the next line then says what is damaged
+        others = []  # the next line then names the damage
     return Clip(frames=read_arrays(path, {"frames": "uint8"}, others=others)["frames"], fps=fps)
 
 

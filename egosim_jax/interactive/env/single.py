@@ -39,6 +39,7 @@ from egosim_jax.interactive.env.rewards import (
     judge,
     no_reward,
 )
+from egosim_jax.interactive.env.space import FAR_M, STATE_POINTS, observation_space
 from egosim_jax.interactive.env.validity import validity
 from egosim_jax.io.bounded import quote
 from egosim_jax.runtime.phases import phase, show_phases
@@ -47,12 +48,8 @@ from egosim_jax.simulation.rig import MountedCamera, check_cameras
 from egosim_jax.simulation.simulator import Step
 from egosim_jax.simulation.start import Start, check_size
 from egosim_jax.state import snapshot
-from egosim_jax.types import InputError, SceneState, VideoSpec, View, check_seed
+from egosim_jax.types import InputError, SceneState, View, check_seed
 
-STATE_POINTS = 2048
-"""Number of points in the observation `state`."""
-FAR_M = 100.0
-"""Depth of empty pixels and bound of observed positions, in meters."""
 OPTIONS = ("start", "episode", "state", "prompt")
 """Options of `reset`."""
 CLOSED = "The environment is closed: make a new one."
@@ -76,27 +73,6 @@ def check_settings(
             f"max_chunks is {max_chunks!r:.40}: it must be a whole number of at least 1."
         )
     check_observe(observe, check_cameras(cameras, (actions or ActionSpec()).sides))
-
-
-def observation_space(video: VideoSpec, spec: ActionSpec, observe: tuple[str, ...]) -> spaces.Dict:
-    """Return the space of the row and the requested observations, also of further cameras."""
-    size = (video.height, video.width)
-    low, high = spec.bounds
-    keypoints = (len(spec.sides), 21 if spec.kind == "human" else 3, 3)
-    by_name = {
-        "frames": spaces.Box(0, 255, (video.frames, *size, 3), np.uint8),
-        "depth": spaces.Box(0, FAR_M, size, np.float32),
-        "keypoints": spaces.Box(-FAR_M, FAR_M, keypoints, np.float64),
-        "state": spaces.Dict(
-            {
-                "points_m": spaces.Box(-FAR_M, FAR_M, (STATE_POINTS, 3), np.float32),
-                "colors": spaces.Box(0, 255, (STATE_POINTS, 3), np.uint8),
-                "object_ids": spaces.Box(-(2**31), 2**31 - 1, (STATE_POINTS,), np.int32),
-            }
-        ),
-    }
-    row = spaces.Box(low, high, dtype=np.float64)
-    return spaces.Dict({"row": row, **{name: by_name[name.split(".")[-1]] for name in observe}})
 
 
 def start_from_options(

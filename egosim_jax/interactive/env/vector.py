@@ -25,11 +25,11 @@ from egosim_jax.interactive.env.single import (
     CLOSED,
     RunningEpisode,
     check_settings,
-    observation_space,
     seed_of,
     start_from_options,
     to_options,
 )
+from egosim_jax.interactive.env.space import observation_space
 from egosim_jax.io.bounded import quote
 from egosim_jax.runtime.phases import phase, show_phases
 from egosim_jax.simulation.rig import MountedCamera

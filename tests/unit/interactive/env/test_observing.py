@@ -7,11 +7,12 @@ import pytest
 from egosim_jax.interactive import env as egosim
 from egosim_jax.interactive.env import load_backend
 from egosim_jax.interactive.env.action_spec import ActionSpec
+from egosim_jax.interactive.env.batching import Batcher
 from egosim_jax.interactive.env.vector import WorldVectorEnv
 from egosim_jax.simulation.rig import MountedCamera
 from egosim_jax.types import InputError, VideoSpec
 from tests import painted as painting
-from tests.painted import VIDEO, painted
+from tests.painted import VIDEO, BatchPainter, PaintedWorld, painted
 
 SIDE = MountedCamera(name="side", mount="world", pose=painting.SIDE)
 WRIST = MountedCamera(name="wrist", mount="right_wrist", pose=painting.WRIST, field_of_view_deg=90)
@@ -62,14 +63,23 @@ def test_a_camera_that_nobody_observes_has_no_clip():
     assert list(env.unwrapped.running.last.others) == ["wrist"]
 
 
-def test_a_vector_environment_makes_all_clips_as_batches():
+def test_the_clips_of_all_cameras_are_rows_of_one_batch():
+    batcher = Batcher(BatchPainter(), max_batch=2, wait_s=30)
+    backend = PaintedWorld(generator=batcher, video=VIDEO, perception=None)
+    env = make(backend, cameras=[WRIST], observe=("frames", "wrist.frames"))
+    env.reset(seed=3)
+    env.unwrapped.chunk_step(ahead(env))
+    assert batcher.runs == {1: 0, 2: 1}
+    batcher.close()
+
+
+def test_a_vector_environment_has_the_cameras_of_each_episode():
     backend = painted(batch=4)
     envs = WorldVectorEnv(backend, 2, cameras=[WRIST], observe=("frames", "wrist.frames"))
     envs.reset(seed=3)
     rows = np.stack([envs.actions.rest + [0, 0.05, 0, 0, 0, 0, 0]] * 2)
     seen, *_ = envs.step(rows)
     assert seen["wrist.frames"].shape == (2, VIDEO.frames, VIDEO.height, VIDEO.width, 3)
-    assert backend.generator.runs == {1: 0, 2: 0, 4: 1}
     single = make(cameras=[WRIST], observe=("frames", "wrist.frames"))
     single.reset(seed=3)
     alone = single.step(rows[0])[0]
