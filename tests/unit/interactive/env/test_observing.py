@@ -64,7 +64,7 @@ def test_a_camera_that_nobody_observes_has_no_clip():
 
 
 def test_the_clips_of_all_cameras_are_rows_of_one_batch():
-    batcher = Batcher(BatchPainter(), max_batch=2, wait_s=30)
+    batcher = Batcher(BatchPainter(), max_batch=2, wait_s=30.0)
     backend = PaintedWorld(generator=batcher, video=VIDEO, perception=None)
     env = make(backend, cameras=[WRIST], observe=("frames", "wrist.frames"))
     env.reset(seed=3)
