@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from egosim_jax.geometry import look_at
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import GeneratedWorld, tabletop_start
 from egosim_jax.interactive.env.batching import Batcher
@@ -21,6 +22,11 @@ from egosim_jax.rendering import reference
 from egosim_jax.types import VideoSpec
 
 VIDEO = VideoSpec(frames=5, height=32, width=48, fps=8)
+UP = np.array([0.0, 0.0, 1.0])
+SIDE = look_at(np.array([0.45, 0.05, 0.42]), np.array([0.0, 0.275, 0.03]), up=UP)
+"""Pose in the world of a camera next to the table."""
+WRIST = look_at(np.array([0.0, -0.06, 0.08]), np.array([0.0, 0.2, -0.04]), up=UP)
+"""Pose on a wrist of a camera that looks along the fingers."""
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ from PIL import Image
 from egosim_jax.io.atomic import atomic_folder
 from egosim_jax.io.bounded import quote_path
 from egosim_jax.io.run import write_json
-from egosim_jax.types import Action, InputError
+from egosim_jax.types import Action, Cameras, InputError
 
 IMAGE, STATE, ACTION = "observation.images.ego", "observation.state", "action"
 HANDS = "observation.hands.joints_m"
@@ -70,6 +70,8 @@ class ClipRecord:
     """Row of hands and camera at each frame."""
     action: Action
     """Cameras, joints of the hands and caption of the clip."""
+    images: Mapping[str, UInt8[np.ndarray, "f h w 3"]] = field(default_factory=dict)
+    """Frames of further cameras, by the name of their feature (`image_feature`)."""
     others: Mapping[str, Float[np.ndarray, "f _"]] = field(default_factory=dict)
     """Other vectors of each frame, by the name of their feature."""
 
@@ -91,8 +93,24 @@ class _Totals:
     episodes: list[dict[str, Any]] = field(default_factory=list)
     frames: int = 0
     sizes: set[tuple[int, ...]] = field(default_factory=set)
+    images: tuple[str, ...] = ()
     vectors: dict[str, int] = field(default_factory=dict)
     statistics: dict[str, list[dict[str, np.ndarray]]] = field(default_factory=dict)
+
+
+def image_feature(camera: str) -> str:
+    """Return the name of a further camera's feature."""
+    return f"observation.images.{camera}"
+
+
+def camera_vectors(camera: str, cameras: Cameras) -> dict[str, Float[np.ndarray, "f _"]]:
+    """Return pose and intrinsics of a further camera at each frame, by the name of the feature."""
+    poses = np.asarray(cameras.world_from_camera, float).reshape(-1, 16)
+    intrinsics = np.asarray(cameras.intrinsics_px, float).reshape(1, 9)
+    return {
+        POSES.replace("camera", f"camera.{camera}", 1): poses,
+        INTRINSICS.replace("camera", f"camera.{camera}", 1): intrinsics.repeat(len(poses), axis=0),
+    }
 
 
 def check_new(folder: Path) -> None:
@@ -138,8 +156,8 @@ def write_lerobot(
 
 def _steps(
     clips: Iterable[ClipRecord], totals: _Totals
-) -> Iterator[tuple[np.ndarray, str, dict[str, np.ndarray]]]:
-    """Yield frame, prompt and vectors of each step; the action of the last step is its own row."""
+) -> Iterator[tuple[dict[str, np.ndarray], str, dict[str, np.ndarray]]]:
+    """Yield images, prompt and vectors of each step; the action of the last step is its own row."""
     last = None
     for last in clips:
         totals.sizes.add(last.frames.shape[1:3])
@@ -148,11 +166,18 @@ def _steps(
                 f"The episodes have clips of the sizes {sorted(totals.sizes)}: all must have one "
                 "size. Export them separately."
             )
-        for number, frame in enumerate(last.frames[:-1]):
-            yield frame, last.action.prompt, _numbers(last, number)
+        for number in range(len(last.frames) - 1):
+            yield _images(last, number), last.action.prompt, _numbers(last, number)
     if last is None:
         raise InputError("An episode has no clip: it needs at least one. Remove it.")
-    yield last.frames[-1], last.action.prompt, _numbers(last, len(last.frames) - 1)
+    number = len(last.frames) - 1
+    yield _images(last, number), last.action.prompt, _numbers(last, number)
+
+
+def _images(clip: ClipRecord, frame: int) -> dict[str, np.ndarray]:
+    """Return the images of a frame by name, the main camera's first."""
+    others = {name: frames[frame] for name, frames in clip.images.items()}
+    return {IMAGE: clip.frames[frame], **others}
 
 
 def _numbers(clip: ClipRecord, frame: int) -> dict[str, np.ndarray]:
@@ -174,22 +199,31 @@ def _write_episode(
     totals: _Totals,
     fps: int | Fraction,
 ) -> None:
-    number, images, prompts, steps = len(totals.episodes), [], [], []
-    counted = []
-    for frame, prompt, step in _steps(clips, totals):
-        counted.append(levels(frame))
-        images.append({"bytes": _png(frame), "path": None})
+    number, prompts, steps = len(totals.episodes), [], []
+    images: dict[str, list[dict[str, Any]]] = {}
+    counted: dict[str, list[np.ndarray]] = {}
+    for shown, prompt, step in _steps(clips, totals):
+        for name, image in shown.items():
+            counted.setdefault(name, []).append(levels(image))
+            images.setdefault(name, []).append({"bytes": _png(image), "path": None})
         prompts.append(prompt)
         totals.tasks.setdefault(prompt, len(totals.tasks))
         steps.append(step)
     vectors = {name: np.stack([step[name] for step in steps]) for name in steps[0]}
-    totals.statistics.setdefault(IMAGE, []).append(image_statistics(counted))
+    if totals.images not in ((), tuple(images)):
+        raise InputError(
+            f"The episodes have the images {list(totals.images)} and {list(images)}: all must have "
+            "the same cameras. Export them separately."
+        )
+    totals.images = tuple(images)
+    for name, of_image in counted.items():
+        totals.statistics.setdefault(name, []).append(image_statistics(of_image))
     for name, values in vectors.items():
         totals.vectors[name] = values.shape[1]
         totals.statistics.setdefault(name, []).append(vector_statistics(values.astype(float)))
     count, first = len(steps), totals.frames
     columns = {
-        IMAGE: images,
+        **images,
         **{name: list(values) for name, values in vectors.items()},
         "timestamp": (np.arange(count) / float(fps)).astype(np.float32),
         "frame_index": np.arange(count),
@@ -198,7 +232,7 @@ def _write_episode(
         "task_index": np.array([totals.tasks[prompt] for prompt in prompts]),
     }
     place = {"chunk_index": number // CHUNK, "file_index": number % CHUNK}
-    _write_table(folder / PATH.format(**place), columns)
+    _write_table(folder / PATH.format(**place), columns, images=totals.images)
     totals.frames += count
     totals.episodes.append(
         {
@@ -214,13 +248,14 @@ def _write_episode(
     )
 
 
-def _write_table(path: Path, columns: dict[str, Any]) -> None:
+def _write_table(path: Path, columns: dict[str, Any], *, images: Sequence[str] = ()) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     image = pa.struct({"bytes": pa.binary(), "path": pa.string()})
     short = pa.list_(pa.float32())
-    types = {IMAGE: image, STATE: short, ACTION: short, "timestamp": pa.float32()}
+    types = {STATE: short, ACTION: short, "timestamp": pa.float32()}
+    types |= dict.fromkeys(images, image)
     arrays = {
         name: pa.array(values, types.get(name, pa.int64() if name in COUNTERS else None))
         for name, values in columns.items()
@@ -275,7 +310,7 @@ def _write_meta(
         "data_path": PATH,
         "video_path": None,
         "features": {
-            IMAGE: image,
+            **dict.fromkeys(totals.images, image),
             STATE: vector,
             ACTION: vector,
             **exact,

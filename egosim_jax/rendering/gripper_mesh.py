@@ -36,7 +36,7 @@ def pose_grippers(joints_m: Float[np.ndarray, "f n 3 3"]) -> MovingMesh:
     reach = np.linalg.norm(along, axis=-1, keepdims=True)
     along = along / np.maximum(reach, 1e-9)
     size = reach / REACH_M
-    across = _across(tips[:, :, 1] - tips[:, :, 0], along)
+    across = across_of(tips[:, :, 1] - tips[:, :, 0], along)
     knuckle = wrist + KNUCKLE_M * size * along
     limbs = [
         (knuckle + across * ((tip - knuckle) * across).sum(axis=-1, keepdims=True), tip)
@@ -60,7 +60,7 @@ def pose_grippers(joints_m: Float[np.ndarray, "f n 3 3"]) -> MovingMesh:
     )
 
 
-def _across(
+def across_of(
     apart: Float[np.ndarray, "f n 3"], along: Float[np.ndarray, "f n 3"]
 ) -> Float[np.ndarray, "f n 3"]:
     """Return the unit direction from finger to finger, across the gripper."""

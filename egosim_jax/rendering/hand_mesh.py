@@ -118,20 +118,26 @@ def _rotations(
     directions: Float[np.ndarray, "f 20 3"],
 ) -> Float[np.ndarray, "f 20 3 3"]:
     """Return the rotation of each bone from the template."""
-    rest, posed = REST_MM[PALM] / 1000, joints[:, PALM]
-    covariance = np.einsum(
-        "fkc,kd->fcd", posed - posed.mean(axis=1, keepdims=True), rest - rest.mean(axis=0)
-    )
-    u, _, vt = np.linalg.svd(covariance)
-    # A proper rotation, never a reflection.
-    u[:, :, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[:, None]
-    palm = u @ vt
+    palm = palm_rotations(joints, "right")
     rotations = np.empty((len(joints), len(along), 3, 3))
     for bone in range(len(along)):
         parent = palm if bone % 4 == 0 else rotations[:, bone - 1]
         turned = parent @ along[bone]
         rotations[:, bone] = smallest_rotation(turned, directions[:, bone]) @ parent
     return rotations
+
+
+def palm_rotations(joints_m: Float[np.ndarray, "f 21 3"], side: Side) -> Float[np.ndarray, "f 3 3"]:
+    """Return the rotation of a hand's palm from a hand whose fingers point along y, palm down."""
+    mirror = np.array([1.0 if side == "right" else -1.0, 1.0, 1.0])
+    rest, posed = REST_MM[PALM] / 1000 * mirror, joints_m[:, PALM]
+    covariance = np.einsum(
+        "fkc,kd->fcd", posed - posed.mean(axis=1, keepdims=True), rest - rest.mean(axis=0)
+    )
+    u, _, vt = np.linalg.svd(covariance)
+    # A proper rotation, never a reflection.
+    u[:, :, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[:, None]
+    return u @ vt
 
 
 @cache

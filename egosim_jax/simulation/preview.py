@@ -78,7 +78,7 @@ class Preview:
 
 def draw(view: View, hands: MovingMesh, cameras: Cameras) -> Video:
     """Return a view without holes, with shaded hands where no point of it is nearer."""
-    frames = np.stack([fill_holes(*images) for images in zip(*_seen(view), strict=True)])
+    frames = without_holes(view)
     rows, columns = _window(hands, cameras)
     if rows.start >= rows.stop or columns.start >= columns.stop:
         return frames
@@ -95,6 +95,11 @@ def draw(view: View, hands: MovingMesh, cameras: Cameras) -> Video:
     share = reduce(front.astype(np.float32), size, "mean", **parts)
     frames[window] = np.round(drawn + shaded * (1 - share))
     return frames
+
+
+def without_holes(view: View) -> Video:
+    """Return the frames of a view; what no point shows is filled from around it."""
+    return np.stack([fill_holes(*images) for images in zip(*_seen(view), strict=True)])
 
 
 def mesh_of(action: Action) -> MovingMesh:
@@ -201,6 +206,10 @@ def _window(hands: MovingMesh, cameras: Cameras) -> tuple[slice, slice]:
     low, high = [*low, center], [*high, center]
     first = np.clip(np.floor(np.min(low, axis=0)), 0, sizes).astype(int)
     last = np.clip(np.ceil(np.max(high, axis=0)) + 1, 0, sizes).astype(int)
+    if (first < last).all():  # the principal point of `Cameras` is inside the image
+        middle = np.clip(cameras.intrinsics_px[[1, 0], 2], 0, np.array(sizes) - 1)
+        first = np.minimum(first, np.floor(middle).astype(int))
+        last = np.maximum(last, np.ceil(middle).astype(int) + 1)
     return slice(*map(int, (first[0], last[0]))), slice(*map(int, (first[1], last[1])))
 
 

@@ -1,14 +1,14 @@
 """Journaled simulation: every phase is saved to a folder, and an interrupted run resumes.
 
 folder/journal.jsonl            finished phases (io/journal.py)
-folder/clip_N/frames.npz        generated clip of step N
+folder/clip_N/frames.npz        generated clip of step N, also as further cameras see it
 folder/clip_N/perceived.npz     perception of the clip
 folder/clip_N/state/            state after the step
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,13 @@ import numpy as np
 from egosim_jax.io.atomic import atomic_write, lock_folder
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.journal import Journal
-from egosim_jax.io.untrusted.npz import read_arrays
+from egosim_jax.io.untrusted.npz import DAMAGE, array_names, read_arrays
 from egosim_jax.perception import archive
 from egosim_jax.runtime.phases import phase
 from egosim_jax.runtime.terminal import counted
 from egosim_jax.simulation.simulator import Made, Phase, Simulator, Step
 from egosim_jax.simulation.streams import Latency
+from egosim_jax.simulation.views import Seen
 from egosim_jax.state import snapshot
 from egosim_jax.types import Action, Clip, SceneState, check_seed
 from egosim_jax.types.arrays import RgbImage, Video
@@ -87,6 +88,7 @@ class Rollout:
                 (simulator.fusion, simulator.point_px, simulator.prior, simulator.fps)
             ),
             "seed": str(seed),
+            **({} if simulator.rig is None else {"cameras": fingerprint(simulator.rig.cameras)}),
         }
 
     def _step(
@@ -104,7 +106,10 @@ class Rollout:
         def load_made(path: Path) -> Made:
             recorded = journal.done[f"{number} generate"]
             times = {field.name: recorded[field.name] for field in fields(Latency)}
-            return Made(clip=load_clip(path, self.simulator.fps), latency=Latency(**times))
+            fps, rig = self.simulator.fps, self.simulator.rig
+            names = () if rig is None else [camera.name for camera in rig.cameras]
+            clip, others = load_clips(path, fps, names)
+            return Made(clip=clip, latency=Latency(**times), others=others)
 
         files: dict[Phase, tuple[Path, Any, Any]] = {
             "generate": (folder / "frames.npz", _save_frames, load_made),
@@ -137,9 +142,32 @@ class Rollout:
 
 def _save_frames(path: Path, made: Made) -> None:
     with atomic_write(path) as temporary:
-        np.savez(temporary, frames=made.clip.frames)
+        arrays: dict[str, Any] = {"frames": made.clip.frames}
+        for name, seen in made.others.items():
+            arrays[f"frames_{name}"] = seen.clip.frames
+            arrays[f"unobserved_{name}"] = np.array(seen.unobserved)
+        np.savez(temporary, **arrays)
 
 
 def load_clip(path: Path, fps: int) -> Clip:
-    """Read the clip of a step from its frames.npz."""
-    return Clip(frames=read_arrays(path, {"frames": "uint8"})["frames"], fps=fps)
+    """Read the main camera's clip of a step from its frames.npz."""
+    try:
+        others = [name for name in array_names(path) if name != "frames"]
+    except DAMAGE:
+        others = []  # the next line then names the damage
+    return Clip(frames=read_arrays(path, {"frames": "uint8"}, others=others)["frames"], fps=fps)
+
+
+def load_clips(path: Path, fps: int, names: Sequence[str]) -> tuple[Clip, dict[str, Seen]]:
+    """Read the clip of a step from its frames.npz, also as further cameras see it, by name."""
+    dtypes = {f"frames_{name}": "uint8" for name in names}
+    dtypes |= {f"unobserved_{name}": "float64" for name in names}
+    arrays = read_arrays(path, {"frames": "uint8", **dtypes})
+    others = {
+        name: Seen(
+            clip=Clip(frames=arrays[f"frames_{name}"], fps=fps),
+            unobserved=float(arrays[f"unobserved_{name}"].item()),
+        )
+        for name in names
+    }
+    return Clip(frames=arrays["frames"], fps=fps), others

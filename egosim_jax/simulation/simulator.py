@@ -14,7 +14,7 @@ the generator. Source: EgoSim, equations 1 and 2 and section 3.4.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import reduce
 from typing import Any, Literal, cast
@@ -26,6 +26,7 @@ from egosim_jax.dynamics import predict
 from egosim_jax.perception import Perception
 from egosim_jax.rendering import POINT_PX, PriorKind, Renderer, reference
 from egosim_jax.simulation.actions import join_actions, slice_action, split_action
+from egosim_jax.simulation.rig import Rig
 from egosim_jax.simulation.streams import (
     ClipStream,
     FrameTimer,
@@ -36,6 +37,7 @@ from egosim_jax.simulation.streams import (
     begin,
     chunk_frames,
 )
+from egosim_jax.simulation.views import OpenViews, Seen
 from egosim_jax.state.fuse import fuse
 from egosim_jax.state.tsdf import Fusion
 from egosim_jax.types import (
@@ -67,6 +69,8 @@ class Made:
     """Generated clip."""
     latency: Latency
     """Latency of its frames."""
+    others: Mapping[str, Seen] = field(default_factory=dict)
+    """The clip as the further cameras see it, by name."""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -83,6 +87,8 @@ class Step(Shown):
     """Words of the perception: new objects, and what it could not decide."""
     latency: Latency | None = None
     """Latency of the frames; None if the clip was made before."""
+    others: Mapping[str, Seen] = field(default_factory=dict)
+    """The clip as the further cameras see it, by name."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,6 +107,8 @@ class Simulator:
     """Callback for each decoded group of frames."""
     update_every: UpdateEvery = "clip"
     """Update of the state after each clip, or after each chunk of a clip."""
+    rig: Rig | None = None
+    """Further cameras, each with its own clip; only the main camera's clip updates the state."""
 
     @property
     def renderer(self) -> Renderer:
@@ -193,7 +201,13 @@ class OpenClip:
         self._put: list[tuple[FrameTimer, View, Action]] = []
         self._frames: list[UInt8[np.ndarray, "f h w 3"]] = []
         self._since_update: list[Action] = []
-        self._kept: Latency | None = None
+        self._kept: Made | None = None
+        self._views = OpenViews(
+            simulator.generator,
+            renderer=simulator.renderer,
+            point_px=simulator.point_px,
+            seed=seed,
+        )
 
     @property
     def is_made(self) -> bool:
@@ -211,10 +225,15 @@ class OpenClip:
         return np.concatenate(self._frames)
 
     @property
+    def others(self) -> Mapping[str, Seen]:
+        """The chunks that were taken as the further cameras see them, by name."""
+        return self._views.seen(self.simulator.fps) if self._kept is None else self._kept.others
+
+    @property
     def latency(self) -> Latency:
         """Latency of the clip so far; it must have a chunk."""
         if self._kept is not None:
-            return self._kept
+            return self._kept.latency
         begun = self._put[0][0].since
         return Latency(
             first_frame_s=self.latencies[0].first_frame_s,
@@ -230,13 +249,14 @@ class OpenClip:
                 self.take()
         if not self.by_chunk:
             self.take()
-        return Made(clip=Clip(frames=self.frames, fps=self.simulator.fps), latency=self.latency)
+        clip = Clip(frames=self.frames, fps=self.simulator.fps)
+        return Made(clip=clip, latency=self.latency, others=self.others)
 
     def replay(self, made: Made, action: Action) -> None:
         """Go through a clip that was made before, in the chunks in which it was made."""
         self.keep(made.clip.frames)
-        self._kept = made.latency
-        self.simulator = replace(self.simulator, show=None)
+        self._kept = made
+        self.simulator = replace(self.simulator, show=None, rig=None)
         self.make(action)
 
     def keep(self, frames: Video) -> None:
@@ -258,6 +278,8 @@ class OpenClip:
             self._stream = begin(simulator.generator, image, self._seed)
         self._stream.put(view, action)
         self._put.append((timer, view, action))
+        if (rig := simulator.rig) is not None:
+            self.run("render", lambda: self._views.put(rig, self.state, action, motion))
 
     def _predict(self, action: Action) -> Motion | None:
         """Return the predicted motion in the next chunk.
@@ -278,6 +300,7 @@ class OpenClip:
     def take(self) -> Video:
         """Return the frames of the oldest chunk that was put; show each group as it is decoded."""
         timer, view, action = self._put[len(self._frames)]
+        self._views.request()
         groups = []
         for group in cast(ClipStream, self._stream).take():
             if group.dtype != np.uint8:  # before it is shown
@@ -286,6 +309,7 @@ class OpenClip:
             groups.append(group)
         frames = self.simulator.check(np.concatenate(groups), view)
         self.latencies.append(timer.latency)
+        self._views.take(self.simulator.check)
         if self.by_chunk:
             self._update_by_chunk(frames, action)
         self._frames.append(frames)
@@ -319,6 +343,7 @@ class OpenClip:
             state=self.state,
             notes=self.notes,
             latency=self.latency,
+            others=self.others,
         )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
@@ -69,6 +70,15 @@ class ChunkedGenerator(VideoGenerator, Protocol):
 
     def begin(self, first_frame: RgbImage, seed: int) -> ClipStream:
         """Begin a clip."""
+        ...
+
+
+@runtime_checkable
+class BatchedGenerator(VideoGenerator, Protocol):
+    """Generator that batches the clips that several threads request."""
+
+    def announced(self) -> AbstractContextManager[None]:
+        """Announce a clip that this thread requests inside the context: batches wait for it."""
         ...
 
 

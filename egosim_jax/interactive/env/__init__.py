@@ -9,6 +9,7 @@ new frame of a clip. Sessions of remote clients are in `server`. Needs the extra
 - `make`, `make_vec`: one environment, or several as a batch.
 - `load_backend`: the world behind an environment.
 - `ActionSpec`: layout and bounds of action rows.
+- `MountedCamera`: further camera, fixed in the world, on the head or on a wrist.
 - `Start`: scene, camera and hands from which an episode continues.
 - `rewards`: `Reward`, `MoveObject`, `GoalImage`.
 """
@@ -24,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.runtime.options import meant
 from egosim_jax.runtime.phases import phase, show_phases
+from egosim_jax.simulation.rig import MountedCamera
 from egosim_jax.simulation.start import Start
 from egosim_jax.types import InputError
 
@@ -33,7 +35,15 @@ if TYPE_CHECKING:
     from egosim_jax.interactive.env.vector import WorldVectorEnv
     from egosim_jax.simulation.episode import Episode
 
-__all__ = ["ActionSpec", "Start", "load_backend", "make", "make_vec", "register"]
+__all__ = [
+    "ActionSpec",
+    "MountedCamera",
+    "Start",
+    "load_backend",
+    "make",
+    "make_vec",
+    "register",
+]
 
 ID = "egosim_jax/Tabletop-v0"
 World = Literal["generated", "true"]
@@ -111,7 +121,8 @@ def make(*, backend: Backend | None = None, world: World | None = None, **option
     from egosim_jax.interactive.env.single import WorldEnv
 
     _check_options(WorldEnv, backend, world, options)
-    return WorldEnv(backend or load_backend(world or "generated"), **options)
+    batch = 1 + _observed_cameras(options)
+    return WorldEnv(backend or load_backend(world or "generated", batch=batch), **options)
 
 
 def make_vec(
@@ -125,8 +136,16 @@ def make_vec(
     from egosim_jax.interactive.env.vector import WorldVectorEnv
 
     _check_options(WorldVectorEnv, backend, world, options)
-    chosen = backend or load_backend(world or "generated", batch=num_envs)
+    batch = num_envs * (1 + _observed_cameras(options))
+    chosen = backend or load_backend(world or "generated", batch=batch)
     return WorldVectorEnv(chosen, num_envs, **options)
+
+
+def _observed_cameras(options: Mapping[str, Any]) -> int:
+    """Return the number of further cameras that have clips."""
+    from egosim_jax.interactive.env.chunks import observed
+
+    return len(observed(options.get("cameras", ()), options.get("observe", ())))
 
 
 def _check_options(env: type, backend: Any, world: Any, options: Mapping[str, Any]) -> None:
@@ -143,7 +162,7 @@ def _check_options(env: type, backend: Any, world: Any, options: Mapping[str, An
         )
     if isinstance(backend, str):
         raise InputError(f"The backend is {backend!r:.40}: name a world by world=.")
-    checked = ("actions", "observe", "max_chunks")
+    checked = ("actions", "observe", "max_chunks", "cameras")
     check_settings(**{name: options[name] for name in checked if name in options})
     fields = [name for name in signature(env).parameters if name not in _POSITIONAL]
     allowed = ["backend", "world", *fields]

@@ -27,6 +27,7 @@ from egosim_jax.io.bounded import quote
 from egosim_jax.rendering.mesh import Side
 from egosim_jax.runtime.terminal import counted
 from egosim_jax.simulation.actions import with_all_joints
+from egosim_jax.simulation.rig import wrist_poses
 from egosim_jax.types import JOINTS, Action, Cameras, InputError, Kind, near_view
 from egosim_jax.worlds.tabletop.hands import joints_of
 
@@ -201,7 +202,7 @@ class ActionSpec:
         `camera` is the first camera of the episode. A hand that never comes near the view is
         missing in the action, which is then a `FullAction`.
         """
-        cameras = replace(camera, world_from_camera=self._cameras(rows, camera))
+        cameras = self.cameras_of(rows, camera)
         joints = self.joints(rows)
         lost = np.logical_not(near_view(cameras, joints).any(axis=0, keepdims=True))[0]
         seen = np.where(lost[None, :, None, None], np.nan, joints)
@@ -222,18 +223,33 @@ class ActionSpec:
             ]
         )
 
+    def wrists(self, rows: Float[np.ndarray, "k d"]) -> Float[np.ndarray, "k n 4 4"]:
+        """Return world_from_wrist of each row's hands (`simulation/rig.py`)."""
+        if self.layout == "keypoints":
+            paths = np.moveaxis(self.joints(rows), 1, 0)
+            sided = zip(paths, self.sides, strict=True)
+            return np.stack([wrist_poses(path, self.kind, side) for path, side in sided], axis=1)
+        count = len(self.sides)
+        hands = rows[:, : len(HAND_NAMES) * count].reshape(len(rows), count, len(HAND_NAMES))
+        poses = np.tile(np.eye(4), (len(rows), count, 1, 1))
+        poses[..., :3, 3] = hands[..., :3]
+        for frame, hand in np.ndindex(len(rows), count):
+            poses[frame, hand, :3, :3] = cv2.Rodrigues(hands[frame, hand, 3:6])[0]
+        return poses
+
     def _placed(self, hand: np.ndarray, side: Side) -> Float[np.ndarray, "j 3"]:
         rotation = cv2.Rodrigues(hand[3:6])[0]
         return joints_of(self.kind, float(hand[6]), side) @ rotation.T + hand[:3]
 
-    def _cameras(self, rows: np.ndarray, camera: Cameras) -> Float[np.ndarray, "k 4 4"]:
+    def cameras_of(self, rows: Float[np.ndarray, "k d"], camera: Cameras) -> Cameras:
+        """Return the main camera of each row; `camera` is the first one of the episode."""
         poses = np.repeat(camera.world_from_camera[:1], len(rows), axis=0)
         if not self.camera:
-            return poses
+            return replace(camera, world_from_camera=poses)
         moves = np.repeat(np.eye(4)[None], len(rows), axis=0)
         for move, row in zip(moves, rows[:, -6:], strict=True):
             move[:3, :3], move[:3, 3] = cv2.Rodrigues(row[3:])[0], row[:3]
-        return poses @ moves
+        return replace(camera, world_from_camera=poses @ moves)
 
     def to_json(self) -> dict[str, Any]:
         """Return the fields as JSON."""

@@ -6,6 +6,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 
+import numpy as np
+from jaxtyping import UInt8
+
 from egosim_jax import configs
 from egosim_jax.generation.choose import preview_note
 from egosim_jax.interactive.env.action_spec import ActionSpec
@@ -16,7 +19,7 @@ from egosim_jax.simulation.preview import Preview
 from egosim_jax.simulation.simulator import Simulator, UpdateEvery
 from egosim_jax.simulation.start import Start
 from egosim_jax.simulation.streams import VideoGenerator, chunk_frames
-from egosim_jax.types import VideoSpec, check_seed
+from egosim_jax.types import Cameras, Kind, VideoSpec, View, check_seed
 from egosim_jax.worlds.tabletop import start_of_sequence
 
 
@@ -42,6 +45,12 @@ class Backend:
     def start(self, seed: int, spec: ActionSpec) -> Start:
         """Return the start of a seed's episode: the tabletop scene with its first camera."""
         return tabletop_start(seed, spec, self.video)
+
+    def first_frame(
+        self, start: Start, camera: Cameras, view: View, kind: Kind
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the first frame of a further camera after a start, from its view of the state."""
+        return preview.without_holes(view)[0]
 
     def note(self, start: Start) -> str | None:
         """Return a one-line warning about the clips from a start, or None."""

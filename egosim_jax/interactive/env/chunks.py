@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any, cast, no_type_check
 
@@ -17,14 +17,18 @@ from jaxtyping import Bool, Float
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.batching import announced
+from egosim_jax.io.bounded import quote
 from egosim_jax.simulation.actions import check_action
+from egosim_jax.simulation.rig import MountedCamera
 from egosim_jax.simulation.simulator import Phase, Simulator, Step
 from egosim_jax.simulation.start import Start
 from egosim_jax.simulation.streams import Latency
 from egosim_jax.state import snapshot
-from egosim_jax.types import Action, Cameras, SceneState, VideoSpec, View
+from egosim_jax.types import Action, Cameras, InputError, SceneState, VideoSpec, View
 
 OBSERVATIONS = ("frames", "depth", "keypoints", "state")
+OF_CAMERA = ("frames", "depth")
+"""Observations of a further camera, after its name and a dot."""
 STATE_FIELDS = ("points_m", "colors", "object_ids")
 """Arrays of the observation `state`."""
 
@@ -63,6 +67,26 @@ class Timing:
     """From the action to the first decoded frames."""
     last_frame_s: float = field(compare=False)
     """From the action to the last decoded frames."""
+
+
+def observation_names(cameras: Iterable[MountedCamera]) -> tuple[str, ...]:
+    """Return the names of all observations."""
+    return OBSERVATIONS + tuple(f"{c.name}.{name}" for c in cameras for name in OF_CAMERA)
+
+
+def check_observe(observe: Iterable[Any], cameras: Iterable[MountedCamera]) -> None:
+    """Raise `InputError` at the first name that is no observation."""
+    names = observation_names(cameras)
+    if unknown := [name for name in observe if name not in names]:
+        raise InputError(
+            f"There is no observation {quote(unknown[0])}: choose from {', '.join(names)}."
+        )
+
+
+def observed(cameras: Iterable[MountedCamera], observe: Iterable[str]) -> tuple[MountedCamera, ...]:
+    """Return the cameras that an observation names."""
+    names = {name.partition(".")[0] for name in observe if "." in name}
+    return tuple(camera for camera in cameras if camera.name in names)
 
 
 def make_chunk(

@@ -16,6 +16,7 @@ from jaxtyping import Float, UInt8
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import Backend
 from egosim_jax.interactive.env.chunks import Chunk, make_chunk
+from egosim_jax.interactive.env.observing import Observer
 from egosim_jax.simulation.actions import split_action
 from egosim_jax.simulation.simulator import OpenClip, Step
 from egosim_jax.simulation.start import Start
@@ -39,10 +40,18 @@ def _parts(chunk_frames: Sequence[int]) -> list[list[int]]:
 class OpenStep:
     """Step of an episode whose rows are given part by part."""
 
-    def __init__(self, backend: Backend, spec: ActionSpec, start: Start, prompt: str | None = None):
-        """Begin the clip that follows a start."""
+    def __init__(
+        self,
+        backend: Backend,
+        spec: ActionSpec,
+        start: Start,
+        prompt: str | None = None,
+        observer: Observer | None = None,
+    ):
+        """Begin the clip that follows a start, also as further cameras observe it."""
         self.start = start
         self._spec, self._video, self._prompt = spec, backend.video, prompt
+        self._observer = observer
         self._parts = _parts(backend.chunk_frames)
         self._rows: list[Float[np.ndarray, "k d"]] = []
         self._clip = OpenClip(
@@ -74,6 +83,10 @@ class OpenStep:
         """Frames of the parts that are made."""
         return self._clip.frames
 
+    def frames_of(self, camera: str) -> UInt8[np.ndarray, "f h w 3"]:
+        """Frames of the parts that are made, as a further camera sees them."""
+        return self._clip.others[camera].clip.frames
+
     @property
     def latency(self) -> Latency:
         """Latency of the last part, since its rows were given."""
@@ -100,6 +113,10 @@ class OpenStep:
         begun = self.done > 0
         lengths = [counts[0] + 1, *counts[1:]] if not begun else [1, *counts]
         actions = split_action(chunk.action, lengths)[int(begun) :]
+        if self._observer is not None:
+            before = self._spec.rest if self.start.row is None else self.start.row
+            rows_so_far = np.concatenate([before[None], *self._rows, chunk.rows[1:]])
+            self._clip.simulator = self._observer.on(self._clip.simulator, rows_so_far)
         taken = len(self._clip.latencies)
         ahead = not self._clip.by_chunk
         frames = []

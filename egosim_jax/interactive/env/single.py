@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, SupportsIndex, cast
@@ -17,16 +17,18 @@ from jaxtyping import Float, UInt8
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import Backend, preview_info
 from egosim_jax.interactive.env.chunks import (
-    OBSERVATIONS,
     STATE_FIELDS,
     Chunk,
+    check_observe,
     last_camera,
     make_chunk,
+    observed,
     state_info,
     straight_path,
     timed_step,
     view_of,
 )
+from egosim_jax.interactive.env.observing import Observer, unobserved_info
 from egosim_jax.interactive.env.parts import OpenStep, part_rows
 from egosim_jax.interactive.env.rewards import (
     Outcome,
@@ -37,25 +39,25 @@ from egosim_jax.interactive.env.rewards import (
     no_reward,
     reward_of,
 )
+from egosim_jax.interactive.env.space import FAR_M, STATE_POINTS, observation_space
 from egosim_jax.interactive.env.validity import validity
 from egosim_jax.io.bounded import quote
 from egosim_jax.runtime.phases import phase, show_phases
 from egosim_jax.simulation.episode import Episode
+from egosim_jax.simulation.rig import MountedCamera, check_cameras
 from egosim_jax.simulation.simulator import Step
 from egosim_jax.simulation.start import Start, check_size
 from egosim_jax.state import snapshot
-from egosim_jax.types import InputError, SceneState, VideoSpec, View, check_seed
+from egosim_jax.types import InputError, SceneState, View, check_seed
 
-STATE_POINTS = 2048
-"""Number of points in the observation `state`."""
-FAR_M = 100.0
-"""Depth of empty pixels and bound of observed positions, in meters."""
 OPTIONS = ("start", "episode", "state", "prompt")
 """Options of `reset`."""
 CLOSED = "The environment is closed: make a new one."
 
 
-def check_settings(*, actions: Any = None, observe: Any = (), max_chunks: Any = 1) -> None:
+def check_settings(
+    *, actions: Any = None, observe: Any = (), max_chunks: Any = 1, cameras: Any = ()
+) -> None:
     """Raise `InputError` for settings that an environment cannot have."""
     if isinstance(observe, str):
         raise InputError(
@@ -70,31 +72,7 @@ def check_settings(*, actions: Any = None, observe: Any = (), max_chunks: Any = 
         raise InputError(
             f"max_chunks is {max_chunks!r:.40}: it must be a whole number of at least 1."
         )
-
-
-def observation_space(video: VideoSpec, spec: ActionSpec, observe: tuple[str, ...]) -> spaces.Dict:
-    """Return the space of the row and the requested observations."""
-    if unknown := [name for name in observe if name not in OBSERVATIONS]:
-        raise InputError(
-            f"There is no observation {unknown[0]!r:.40}: choose from {', '.join(OBSERVATIONS)}."
-        )
-    size = (video.height, video.width)
-    low, high = spec.bounds
-    keypoints = (len(spec.sides), 21 if spec.kind == "human" else 3, 3)
-    by_name = {
-        "frames": spaces.Box(0, 255, (video.frames, *size, 3), np.uint8),
-        "depth": spaces.Box(0, FAR_M, size, np.float32),
-        "keypoints": spaces.Box(-FAR_M, FAR_M, keypoints, np.float64),
-        "state": spaces.Dict(
-            {
-                "points_m": spaces.Box(-FAR_M, FAR_M, (STATE_POINTS, 3), np.float32),
-                "colors": spaces.Box(0, 255, (STATE_POINTS, 3), np.uint8),
-                "object_ids": spaces.Box(-(2**31), 2**31 - 1, (STATE_POINTS,), np.int32),
-            }
-        ),
-    }
-    row = spaces.Box(low, high, dtype=np.float64)
-    return spaces.Dict({"row": row, **{name: by_name[name] for name in observe}})
+    check_observe(observe, check_cameras(cameras, (actions or ActionSpec()).sides))
 
 
 def start_from_options(
@@ -177,8 +155,11 @@ class RunningEpisode:
         *,
         reward: RewardFn,
         max_chunks: int,
+        cameras: tuple[MountedCamera, ...] = (),
     ):
         self.backend, self.actions, self.start, self.now = backend, actions, start, start
+        self.observer = Observer(backend=backend, actions=actions, cameras=cameras)
+        self._first_frames = self.observer.first_frames(start)
         self._reward, self._max_chunks, self.ended = reward, max_chunks, False
         self.camera = start.camera
         self.last: Step | None = None
@@ -207,7 +188,7 @@ class RunningEpisode:
         """Return the step of a chunk and its metadata, without changing the episode."""
         now = self.now
         step, timing = timed_step(
-            self.backend.simulator(now),
+            self.observer.on(self.backend.simulator(now), chunk.rows),
             now.state,
             chunk.action,
             seed=now.seed + now.steps + 1,
@@ -217,7 +198,7 @@ class RunningEpisode:
 
     def open(self, prompt: str | None) -> OpenStep:
         """Begin the next step, whose rows are given part by part."""
-        return OpenStep(self.backend, self.actions, self.now, prompt)
+        return OpenStep(self.backend, self.actions, self.now, prompt, self.observer)
 
     def facts(self, chunk: Chunk, step: Step) -> dict[str, Any]:
         """Return the metadata of a step of a chunk."""
@@ -228,6 +209,7 @@ class RunningEpisode:
             **preview_info(simulator.generator),
             "notes": list(step.notes),
             **validity(now.state, step, chunk.action, simulator.renderer),
+            **unobserved_info(step),
         }
 
     def judged(self, step: Step) -> Reward:
@@ -259,6 +241,12 @@ class RunningEpisode:
             first = self._view().frames[0]
         return np.repeat(first[None], self.backend.video.frames, axis=0)
 
+    def frames_of(self, camera: str) -> UInt8[np.ndarray, "f h w 3"]:
+        """Return what `frames` does, as a further camera sees it."""
+        if self.last is not None:
+            return self.last.others[camera].clip.frames
+        return np.repeat(self._first_frames[camera][None], self.backend.video.frames, axis=0)
+
     def _view(self) -> View:
         return view_of(self.backend.simulator(self.now), self.now.state, self.camera)
 
@@ -269,6 +257,14 @@ class RunningEpisode:
             seen["frames"] = self.frames().copy()
         if "depth" in observe:
             seen["depth"] = np.minimum(self._view().depth_m[0], np.float32(FAR_M))
+        for name in observe:
+            camera, _, what = name.partition(".")
+            if what == "frames":
+                seen[name] = self.frames_of(camera).copy()
+            elif what:
+                now = self.now
+                depth = self.observer.depth(camera, now, now.state, self.camera, self.row)
+                seen[name] = np.minimum(depth, np.float32(FAR_M))
         if "keypoints" in observe:
             seen["keypoints"] = self.actions.joints(self.row[None])[0].copy()
         if "state" in observe:
@@ -293,8 +289,9 @@ class WorldEnv(gymnasium.Env):
         reward: RewardFn | str = no_reward,
         max_chunks: int = 10,
         render_mode: str | None = None,
+        cameras: Sequence[MountedCamera] = (),
     ):
-        check_settings(actions=actions, observe=observe, max_chunks=max_chunks)
+        check_settings(actions=actions, observe=observe, max_chunks=max_chunks, cameras=cameras)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InputError(
                 f"render_mode is {render_mode!r:.40}: it must be 'rgb_array' or None. The page of "
@@ -304,7 +301,7 @@ class WorldEnv(gymnasium.Env):
         self.metadata = {**self.metadata, "render_fps": backend.video.fps}
         self.render_mode = render_mode
         self._observe, self._max_chunks = tuple(observe), max_chunks
-        self._reward = reward_of(reward)
+        self._reward, self._cameras = reward_of(reward), observed(cameras, observe)
         low, high = self.actions.bounds
         self.action_space = spaces.Box(low, high, dtype=np.float64)
         self.observation_space = observation_space(backend.video, self.actions, self._observe)
@@ -340,7 +337,8 @@ class WorldEnv(gymnasium.Env):
         with show_phases(), phase("makes the scene", only_if_long=True):
             start = start_from_options(self.backend, self.actions, seed=chosen, options=options)
         check_reward(self._reward, start)
-        limits = {"reward": self._reward, "max_chunks": self._max_chunks}
+        limits: dict[str, Any] = {"reward": self._reward, "max_chunks": self._max_chunks}
+        limits["cameras"] = self._cameras
         self._running = RunningEpisode(self.backend, self.actions, start, **limits)
         self._open = None
         return self.running.observation(self._observe), self.running.info()
@@ -392,6 +390,11 @@ class WorldEnv(gymnasium.Env):
             if "frames" in seen:
                 missing = self.backend.video.frames - len(step.frames)
                 seen["frames"] = np.pad(step.frames, ((0, missing), *[(0, 0)] * 3), mode="edge")
+            for camera in self._cameras:
+                if (name := f"{camera.name}.frames") in seen:
+                    frames = step.frames_of(camera.name)
+                    missing = self.backend.video.frames - len(frames)
+                    seen[name] = np.pad(frames, ((0, missing), *[(0, 0)] * 3), mode="edge")
             seen["row"] = step.row.copy()
             if "keypoints" in seen:
                 seen["keypoints"] = self.actions.joints(step.row[None])[0]

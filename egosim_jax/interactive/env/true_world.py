@@ -22,6 +22,7 @@ from egosim_jax.simulation.simulator import Simulator
 from egosim_jax.simulation.start import Start
 from egosim_jax.types import (
     Action,
+    Cameras,
     Clip,
     InputError,
     Kind,
@@ -30,7 +31,9 @@ from egosim_jax.types import (
     View,
 )
 from egosim_jax.worlds.tabletop import TabletopClip, World, observation_of, start_of_sequence
-from egosim_jax.worlds.tabletop.clips import POINT_PX
+from egosim_jax.worlds.tabletop.clips import POINT_PX, film, render_scenes
+from egosim_jax.worlds.tabletop.scene import Scene
+from egosim_jax.worlds.tabletop.world import arms_of
 
 MAX_CACHED_WORLDS = 256
 """Maximum number of cached worlds; without a cache each step repeats its episode from the start."""
@@ -70,6 +73,12 @@ class TrueWorld(Backend):
             fps=self.video.fps,
         )
 
+    def first_frame(
+        self, start: Start, camera: Cameras, view: View, kind: Kind
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the true first frame of a further camera, without hands."""
+        return render_scenes([self.after(start, kind).scene], camera)[0].colors
+
     def after(self, start: Start, kind: Kind) -> World:
         """Return the world after all past actions of a start."""
         key = f"{start.seed} {kind}"
@@ -106,6 +115,7 @@ class _Execution:
     world: TrueWorld
     start: Start
     _made: tuple[Action, TabletopClip] | None = None
+    _moved: tuple[np.ndarray, list[Scene]] | None = None
 
     def clip(self, action: Action) -> TabletopClip:
         """Return the clip of an action."""
@@ -114,6 +124,16 @@ class _Execution:
             clip, _ = world.execute(action, joints_m=all_joints_of(action))
             self._made = action, clip
         return self._made[1]
+
+    def frames(self, action: Action) -> UInt8[np.ndarray, "f h w 3"]:
+        """Return the frames of the first action, or of the same one as another camera sees it."""
+        if self._made is None or self._made[0] is action:
+            return self.clip(action).frames
+        joints = all_joints_of(action)
+        if self._moved is None or not np.array_equal(self._moved[0], joints, equal_nan=True):
+            world = self.world.after(self.start, action.kind)
+            self._moved = joints, world.move(action, joints_m=joints)[0]
+        return film(self._moved[1], action.cameras, arms=arms_of(joints, action.kind))
 
     def fingerprint(self) -> str:
         """Return the content hash of the scene and the past actions."""
@@ -131,7 +151,7 @@ class _TrueGenerator:
     def __call__(
         self, view: View, action: Action, first_frame: UInt8[np.ndarray, "h w 3"], seed: int
     ) -> UInt8[np.ndarray, "f h w 3"]:
-        return self.execution.clip(action).frames
+        return self.execution.frames(action)
 
 
 @dataclass(frozen=True, kw_only=True)

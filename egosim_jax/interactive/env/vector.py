@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
 from egosim_jax.interactive.env.backends import Backend
-from egosim_jax.interactive.env.chunks import straight_path
+from egosim_jax.interactive.env.chunks import observed, straight_path
 from egosim_jax.interactive.env.rewards import (
     RewardFn,
     check_reward,
@@ -25,13 +25,14 @@ from egosim_jax.interactive.env.single import (
     CLOSED,
     RunningEpisode,
     check_settings,
-    observation_space,
     seed_of,
     start_from_options,
     to_options,
 )
+from egosim_jax.interactive.env.space import observation_space
 from egosim_jax.io.bounded import quote
 from egosim_jax.runtime.phases import phase, show_phases
+from egosim_jax.simulation.rig import MountedCamera
 from egosim_jax.types import InputError, check_counts
 
 Seeds = SupportsIndex | Sequence[SupportsIndex | None] | np.ndarray | None
@@ -69,9 +70,11 @@ class WorldVectorEnv(VectorEnv):
         observe: tuple[str, ...] = ("frames",),
         reward: RewardFn | str | Sequence[RewardFn | str] = no_reward,
         max_chunks: int = 10,
+        cameras: Sequence[MountedCamera] = (),
     ):
         check_counts({"num_envs": num_envs})
-        check_settings(actions=actions, observe=observe, max_chunks=max_chunks)
+        check_settings(actions=actions, observe=observe, max_chunks=max_chunks, cameras=cameras)
+        self._cameras = observed(cameras, observe)
         self.num_envs, self.backend, self.actions = num_envs, backend, actions or ActionSpec()
         self._observe, self._max_chunks = tuple(observe), max_chunks
         single = callable(reward) or isinstance(reward, str)
@@ -137,9 +140,15 @@ class WorldVectorEnv(VectorEnv):
             ]
         for number, start in zip(chosen, begun, strict=True):
             check_reward(self._rewards[number], start)
-        for number, start in zip(chosen, begun, strict=True):
-            limits = {"reward": self._rewards[number], "max_chunks": self._max_chunks}
-            self._running[number] = RunningEpisode(self.backend, self.actions, start, **limits)
+        limits = {"max_chunks": self._max_chunks, "cameras": self._cameras}
+        running = [
+            RunningEpisode(
+                self.backend, self.actions, start, reward=self._rewards[number], **limits
+            )
+            for number, start in zip(chosen, begun, strict=True)
+        ]
+        for number, episode in zip(chosen, running, strict=True):
+            self._running[number] = episode
         with show_phases(), phase("draws the first observations", only_if_long=True):
             return self._observations(), self._infos([running.info() for running in self.running])
 

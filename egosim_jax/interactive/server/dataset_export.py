@@ -8,7 +8,13 @@ from pathlib import Path
 from typing import Any, get_args
 
 from egosim_jax.data.clip_files import prior_column
-from egosim_jax.data.lerobot_writer import ClipRecord, EpisodeRecord, write_lerobot
+from egosim_jax.data.lerobot_writer import (
+    ClipRecord,
+    EpisodeRecord,
+    camera_vectors,
+    image_feature,
+    write_lerobot,
+)
 from egosim_jax.data.pack import triplet_record
 from egosim_jax.data.shards import ShardWriter
 from egosim_jax.interactive.env.backends import GeneratedWorld
@@ -153,6 +159,12 @@ def to_lerobot(sessions: Sequence[Session], folder: Path) -> None:
             f"The sessions have {len(names)} kinds of actions and clips of {len(videos)} sizes or "
             "rates: a dataset has one. Export them separately. (--session)"
         )
+    cameras = {session.observer.cameras for session in sessions}
+    if len(cameras) > 1:
+        raise InputError(
+            f"The sessions have {len(cameras)} sets of further cameras: a dataset has one. Export "
+            "them separately. (--session)"
+        )
     episodes = (
         EpisodeRecord(clips=_clips(session, steps), save_scene=start.save)
         for session in sessions
@@ -177,10 +189,16 @@ def _has_previews(session: Session) -> bool:
 
 def _clips(session: Session, steps: Sequence[int]) -> Iterator[ClipRecord]:
     for number in steps:
+        result, action = session.load_result(number), session.action(number)
+        rows, observer = session.rows(number), session.observer
+        paths = observer.paths(action.cameras, rows) if observer.cameras else {}
+        vectors = [camera_vectors(name, path) for name, path in paths.items()]
         yield ClipRecord(
-            frames=session.load_result(number).frames,
-            rows=session.rows(number),
-            action=session.action(number),
+            frames=result.frames,
+            rows=rows,
+            action=action,
+            images={image_feature(name): frames for name, frames in result.others.items()},
+            others={name: values for of_camera in vectors for name, values in of_camera.items()},
         )
 
 

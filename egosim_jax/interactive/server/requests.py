@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from numbers import Integral
 from typing import Any
 
 from egosim_jax.interactive.env.action_spec import to_numbers
-from egosim_jax.interactive.env.chunks import OBSERVATIONS
+from egosim_jax.interactive.env.chunks import observation_names
 from egosim_jax.io.bounded import quote
 from egosim_jax.io.digest import fingerprint
+from egosim_jax.simulation.rig import MAX_CAMERAS, MountedCamera
 from egosim_jax.types import InputError
 
 REQUESTS = {
-    "create": ("session", "seed", "prompt", "episode", "actions", "observe"),
+    "create": ("session", "seed", "prompt", "episode", "actions", "observe", "cameras"),
     "step": ("session", "step_id", "part", "actions", "prompt", "observe", "stream"),
     "reset": ("session", "seed", "prompt", "episode", "observe"),
     "save": ("session", "name"),
@@ -61,15 +62,28 @@ def is_streamed(message: Any) -> bool:
     return stream
 
 
-def observations_of(request: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the requested observations, by default the frames."""
-    names = request.get("observe", ["frames"])
+def observations_of(
+    request: Mapping[str, Any], cameras: Sequence[MountedCamera] = ()
+) -> tuple[str, ...]:
+    """Return the requested observations, by default the frames of the main camera."""
+    names, known = request.get("observe", ["frames"]), observation_names(cameras)
     given = names if isinstance(names, list | tuple) else [names]
-    if unknown := [n for n in given if not (isinstance(n, str) and n in OBSERVATIONS)]:
+    if unknown := [n for n in given if not (isinstance(n, str) and n in known)]:
         raise InputError(
-            f"observe has {quote(unknown[0])}: it must be a list of {', '.join(OBSERVATIONS)}."
+            f"observe has {quote(unknown[0])}: it must be a list of {', '.join(known)}."
         )
     return tuple(given)
+
+
+def cameras_of(request: Mapping[str, Any]) -> tuple[MountedCamera, ...]:
+    """Return the further cameras of a new session. Raises `InputError` for a bad declaration."""
+    given = request.get("cameras", [])
+    if not isinstance(given, list | tuple) or len(given) > MAX_CAMERAS:
+        raise InputError(
+            f"cameras is {quote(given)}: it must be a list of at most {MAX_CAMERAS} maps, one for "
+            "each further camera. (cameras)"
+        )
+    return tuple(MountedCamera.from_json(fields) for fields in given)
 
 
 def prompt_of(request: Mapping[str, Any]) -> str | None:

@@ -26,6 +26,7 @@ from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.interactive.server.prometheus import Metrics
 from egosim_jax.interactive.server.requests import (
     REQUESTS,
+    cameras_of,
     is_streamed,
     observations_of,
     parse_request,
@@ -34,6 +35,7 @@ from egosim_jax.interactive.server.session import Result, Session
 from egosim_jax.interactive.server.store import Store
 from egosim_jax.io.executables import share_with_jax
 from egosim_jax.runtime.processes import return_freed_blocks
+from egosim_jax.simulation.rig import MOUNTS
 from egosim_jax.types import InputError
 
 T = TypeVar("T")
@@ -105,6 +107,7 @@ class Service(Requests):
             "part_rows": list(part_rows(self.store.backend.chunk_frames)),
             "layouts": list(LAYOUTS),
             "observations": list(OBSERVATIONS),
+            "mounts": list(MOUNTS),
             "requests": {name: list(fields) for name, fields in REQUESTS.items()},
             "limits": limits.to_json(),
         }
@@ -129,16 +132,20 @@ class Service(Requests):
 
     async def _reply_to(self, name: str, request: Mapping[str, Any]) -> dict[str, Any]:
         """Return the reply to a request that is not streamed."""
-        observe, store = observations_of(request), self.store
+        store = self.store
         if name == "status":
             return self.status(request)
         if name == "create":
+            observe = observations_of(request, cameras_of(request))
             session = await self._wait(store.submit(lambda: store.create(request)))
             low, high = session.actions.bounds
             spec = {**session.actions.to_json(), "names": list(session.actions.names)}
             reply = await self._reply(session, session.result, observe)
-            return {**reply, "actions": {**spec, "low": low, "high": high}}
+            cameras = [camera.to_json() for camera in session.observer.cameras]
+            about = {"cameras": cameras} if cameras else {}
+            return {**reply, "actions": {**spec, "low": low, "high": high}, **about}
         session = store.get(request.get("session"))
+        observe = observations_of(request, session.observer.cameras)
         if name == "save":
             saved = await self._wait(store.save(request))
             return {"session": session.id, "step_id": session.committed, "name": saved}
@@ -160,7 +167,8 @@ class Service(Requests):
             yield await self._reply_to(name, request)
             return
         then, times = time.monotonic(), []
-        observe = observations_of(request)
+        session = self.store.get(request.get("session"))
+        observe = observations_of(request, session.observer.cameras)
         groups: asyncio.Queue[UInt8[np.ndarray, "g h w 3"] | None] = asyncio.Queue()
         loop = asyncio.get_running_loop()
 
@@ -168,7 +176,7 @@ class Service(Requests):
             with suppress(RuntimeError):  # the loop has ended, and the step finishes without it
                 loop.call_soon_threadsafe(groups.put_nowait, frames)
 
-        session, future = self.store.get(request.get("session")), self.store.step(request, show)
+        future = self.store.step(request, show)
         made = asyncio.ensure_future(self._wait(future))
         made.add_done_callback(lambda _: groups.put_nowait(None))
         try:
@@ -199,12 +207,14 @@ class Service(Requests):
                 "draining": self.store.draining,
             }
         session = self.store.get(request["session"])
+        cameras = [camera.to_json() for camera in session.observer.cameras]
         return {
             "session": session.id,
             "committed_step_id": session.committed,
             "busy": session.busy,
             "saved": session.saved,
             "actions": session.actions.to_json(),
+            **({"cameras": cameras} if cameras else {}),
             **session.result.info,
         }
 
@@ -235,6 +245,9 @@ class Service(Requests):
             reply["frames"] = result.frames
         if "keypoints" in observe:
             reply["keypoints"] = session.actions.joints(result.row[None])[0]
+        for item in observe:
+            if item.endswith(".frames") and result.part is None:
+                reply[item] = result.others[item.partition(".")[0]]
         if (latency := result.latency) is not None:  # of a part, which changes no state
             seconds = {"first_frames_s": latency.first_frame_s}
             seconds["last_frames_s"] = latency.last_frame_s
@@ -247,6 +260,14 @@ class Service(Requests):
             render = partial(view_of, simulator, result.state, result.camera)
             view = await self._wait(self.store.submit(render, bounded=False))
             reply["depth"] = np.asarray(view.depth_m[0])
+        for item in observe:
+            camera, _, what = item.partition(".")
+            if what == "depth":
+                seen = partial(
+                    session.observer.depth, camera, session.now, result.state, result.camera,
+                    result.row,
+                )  # fmt: skip
+                reply[item] = await self._wait(self.store.submit(seen, bounded=False))
         return reply
 
 

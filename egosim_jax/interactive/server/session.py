@@ -17,10 +17,10 @@ removed, and the session stays at the step before.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, no_type_check
 
@@ -31,6 +31,7 @@ from egosim_jax.interactive.env.action_spec import ActionSpec, to_numbers
 from egosim_jax.interactive.env.backends import Backend, preview_info
 from egosim_jax.interactive.env.batching import announced
 from egosim_jax.interactive.env.chunks import Chunk, last_camera, make_chunk, state_info, view_of
+from egosim_jax.interactive.env.observing import Observer, unobserved_info
 from egosim_jax.interactive.env.validity import validity
 from egosim_jax.interactive.server import wire
 from egosim_jax.interactive.server.errors import RequestError
@@ -39,7 +40,8 @@ from egosim_jax.io.atomic import atomic_folder
 from egosim_jax.io.bounded import check_inside, only_inside, quote, quote_path, read_json
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.io.run import plain, write_json
-from egosim_jax.simulation.rollout import Rollout, load_clip
+from egosim_jax.simulation.rig import MountedCamera
+from egosim_jax.simulation.rollout import Rollout, load_clips
 from egosim_jax.simulation.start import Start, check_size
 from egosim_jax.simulation.streams import Latency, Show
 from egosim_jax.state import snapshot
@@ -67,6 +69,8 @@ class Result:
     """Last row of hands and camera."""
     camera: Cameras
     """Camera of the last frame."""
+    others: Mapping[str, UInt8[np.ndarray, "f h w 3"]] = field(default_factory=dict)
+    """The frames as the further cameras see them, by name; none of a part."""
     info: Mapping[str, Any]
     """Metadata of the step: hash of the state, padded frames, validity and more."""
     part: int | None = None
@@ -82,7 +86,10 @@ class Session:
         """Open a folder of `create`, also a closed one. Raises `InputError` if it is damaged."""
         self.folder, self.backend = folder, backend
         self.id = folder.name
-        self.actions = ActionSpec.from_json(settings_of(folder)["actions"])
+        settings = settings_of(folder)
+        self.actions = ActionSpec.from_json(settings["actions"])
+        cameras = tuple(map(MountedCamera.from_json, settings.get("cameras", ())))
+        self.observer = Observer(backend=backend, actions=self.actions, cameras=cameras)
         for name in ("starts", "steps", "saved"):
             check_inside(folder / name)  # before its files are listed
         self.running: tuple[tuple[int, str] | None, Future[Any]] | None = None
@@ -93,7 +100,14 @@ class Session:
         self.now, self.result = self._restore()
 
     @classmethod
-    def create(cls, folder: Path, backend: Backend, actions: ActionSpec, start: Start) -> Session:
+    def create(
+        cls,
+        folder: Path,
+        backend: Backend,
+        actions: ActionSpec,
+        start: Start,
+        cameras: Sequence[MountedCamera] = (),
+    ) -> Session:
         """Write and open a new session, complete or absent."""
         settings = {
             "actions": actions.to_json(),
@@ -102,6 +116,7 @@ class Session:
             "prior": backend.simulator(start).prior,
             "seed": start.seed,
             "world": backend.identity(),
+            **({"cameras": [camera.to_json() for camera in cameras]} if cameras else {}),
         }
         with atomic_folder(folder) as temporary:
             start.save(temporary / "starts" / "0")
@@ -181,9 +196,11 @@ class Session:
         info = self._state_info(start.state, self.committed)
         if note := self.backend.note(start):
             info["scene_warning"] = note
+        firsts = self.observer.first_frames(start)
         return Result(
             step_id=self.committed,
             frames=image[None],
+            others={name: first[None] for name, first in firsts.items()},
             state=start.state,
             row=self.actions.rest if start.row is None else start.row,
             camera=start.camera,
@@ -226,9 +243,12 @@ class Session:
         if not isinstance(info, dict):
             raise InputError(f"{quote_path(folder / INFO)} does not describe a step. Restore it.")
         state = clip / "state"
+        names = [camera.name for camera in self.observer.cameras]
+        made, others = load_clips(clip / "frames.npz", self.backend.video.fps, names)
         return Result(
             step_id=number,
-            frames=load_clip(clip / "frames.npz", self.backend.video.fps).frames,
+            frames=made.frames,
+            others={name: seen.clip.frames for name, seen in others.items()},
             # without perception, no step writes a state: the start's one stays
             state=snapshot.load(state if state.exists() else self._base(number) / "state"),
             row=self.rows(number)[-1],
@@ -329,6 +349,7 @@ class Session:
     ) -> Result:
         folder, action, now = self._step(number), self.action(number), self.now
         simulator = replace(self.backend.simulator(now), show=show)
+        simulator = self.observer.on(simulator, self.rows(number))
         generator = simulator.generator
         with announced(generator) if frames is None else nullcontext():
             name = f"session {self.id}, step {number}"
@@ -347,6 +368,7 @@ class Session:
             "notes": list(step.notes),
             **preview_info(generator),
             **wire.to_json(validity(now.state, step, action, simulator.renderer)),
+            **unobserved_info(step),
         }
         row = np.array(request["rows"][-1], float)
         write_json(folder / INFO, info)
@@ -354,6 +376,7 @@ class Session:
         return Result(
             step_id=number,
             frames=step.clip.frames,
+            others={name: seen.clip.frames for name, seen in step.others.items()},
             state=step.state,
             row=row,
             camera=last_camera(action),

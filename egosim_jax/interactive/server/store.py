@@ -24,6 +24,7 @@ from egosim_jax.interactive.server.errors import RequestError, as_request_error
 from egosim_jax.interactive.server.parts import Parts
 from egosim_jax.interactive.server.prometheus import Metrics
 from egosim_jax.interactive.server.requests import (
+    cameras_of,
     check_integer,
     check_mapping,
     check_name,
@@ -43,6 +44,7 @@ from egosim_jax.io.atomic import atomic_write, lock_folder
 from egosim_jax.io.bounded import only_inside, quote, quote_path
 from egosim_jax.runtime.terminal import printable
 from egosim_jax.simulation.episode import Episode
+from egosim_jax.simulation.rig import check_cameras
 from egosim_jax.simulation.start import Start, check_size
 from egosim_jax.simulation.streams import Show
 from egosim_jax.types import InputError
@@ -123,11 +125,12 @@ class Store:
         """Create a session from a seed or episode, with the requested id or a new one."""
         self._check_open()
         actions = ActionSpec.from_json(check_mapping(request.get("actions", {}), "actions"))
+        cameras = check_cameras(cameras_of(request), actions.sides)
         name = check_name(request.get("session", secrets.token_hex(8)), "session")
         folder = self._reserve(name)
         try:
             start = self._start(request, actions)
-            session = Session.create(folder, self.backend, actions, start)
+            session = Session.create(folder, self.backend, actions, start, cameras)
             with self._changing:
                 self.sessions[name] = session
                 self.metrics.sessions.set(len(self.sessions))

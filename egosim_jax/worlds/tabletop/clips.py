@@ -167,6 +167,20 @@ def render_scenes(
     return rendered
 
 
+def film(
+    scenes: Sequence[Scene], cameras: Cameras, *, arms: Sequence[Sequence[Arm | None]]
+) -> UInt8[np.ndarray, "f h w 3"]:
+    """Return the frames of a camera that a hand may move into an object: black inside of it."""
+    frames = np.zeros((len(scenes), cameras.height, cameras.width, 3), np.uint8)
+    for frame, scene, present, pose in zip(
+        frames, scenes, arms, cameras.world_from_camera, strict=True
+    ):
+        caster = RayCaster(place(scene, present))
+        if not caster.rays.contain(pose[:3, 3]):
+            frame[:] = _render(caster, pose, cameras).colors
+    return frames
+
+
 def place(scene: Scene, arms: Sequence[Arm | None]) -> list[Placed]:
     """Return every part of the scene and the arms with its pose and id; arms are in world frame."""
     return scene.placed() + [

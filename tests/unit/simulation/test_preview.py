@@ -76,6 +76,16 @@ def test_nearer_points_hide_hands():
     assert drawn[-1, :, 41:].any()
 
 
+def test_a_hand_in_a_corner_of_the_image_is_drawn():
+    """Its window does not contain the middle of the image."""
+    acted = action()
+    acted = replace(acted, joints_m=acted.joints_m + [0.4, 0.2, 0.3])
+    drawn = is_drawn(make(view(), acted))
+    assert drawn[:, 30:, 50:].any()
+    assert not drawn[:, :20].any()
+    assert not drawn[..., :35].any()
+
+
 def test_surfaces_near_hands_are_darker_and_others_are_not():
     frames = make(view(depth_m=0.65), action()).astype(int)
     wall = ~is_drawn(frames)

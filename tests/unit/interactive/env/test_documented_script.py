@@ -12,7 +12,7 @@ from egosim_jax.types import VideoSpec
 ROOT = Path(__file__).parents[4]
 VIDEO = VideoSpec(frames=17, height=8, width=16, fps=8)
 TEXT = (ROOT / "docs" / "environments.md").read_text("utf-8")
-LIFT, BATCH = re.findall(r"```python\n(.*?)```", TEXT, re.S)
+LIFT, BATCH, CAMERAS = re.findall(r"```python\n(.*?)```", TEXT, re.S)
 
 
 @pytest.fixture(autouse=True)
@@ -29,6 +29,12 @@ def run(script):
 def test_the_documented_policy_lifts_the_object_whose_pose_it_reads(capsys):
     run(LIFT)
     assert capsys.readouterr().out == "red box rises by 0.1 m\n"
+
+
+def test_the_documented_cameras_show_the_true_world(capsys):
+    run(CAMERAS)
+    shape = (VIDEO.frames, VIDEO.height, VIDEO.width, 3)
+    assert capsys.readouterr().out.startswith(f"{shape} {{'wrist': 0.")
 
 
 @pytest.mark.slow

@@ -8,8 +8,10 @@ import pytest
 
 from egosim_jax.interactive.env.parts import part_rows
 from egosim_jax.interactive.env.single import WorldEnv
+from egosim_jax.simulation.rig import MountedCamera
 from egosim_jax.simulation.simulator import Simulator
 from egosim_jax.types import InputError
+from tests import painted as painting
 from tests.painted import VIDEO, ChunkPainter, PaintedWorld
 
 WORLD = PaintedWorld(generator=ChunkPainter(), video=VIDEO, perception=None)
@@ -81,3 +83,18 @@ def test_a_state_that_is_updated_by_chunk_sees_each_chunk_from_the_last_frame_on
     assert seen == [(3, 3, 0), (3, 3, 1)]
     assert info["notes"] == ["note 0", "note 1"]
     assert by_chunk.running.now.state.step == 2
+
+
+def test_further_cameras_show_each_part():
+    wrist = MountedCamera(name="wrist", mount="right_wrist", pose=painting.WRIST)
+    env = WorldEnv(WORLD, cameras=[wrist], observe=("frames", "wrist.frames"))
+    env.reset(seed=3)
+    rows = ahead(env)
+    part, *_ = env.part_step(rows[:2])
+    last, *_ = env.part_step(rows[2:])
+    env.reset(seed=3)
+    expected, *_ = env.chunk_step(rows)
+    for name in ("frames", "wrist.frames"):
+        np.testing.assert_array_equal(part[name][:3], expected[name][:3])
+        np.testing.assert_array_equal(part[name][3:], expected[name][2:3].repeat(2, axis=0))
+        np.testing.assert_array_equal(last[name], expected[name])

@@ -16,7 +16,8 @@ from egosim_jax.interactive.server import dataset_export, session
 from egosim_jax.interactive.server.store import Store
 from egosim_jax.runtime.command import ExitCode
 from egosim_jax.types import WAN_GRID, InputError, Motion, ObjectPath
-from tests.painted import VIDEO, PaintedWorld, Painter, painted
+from tests.painted import VIDEO, WRIST, PaintedWorld, Painter, painted
+from tests.unit.interactive.server.served import step
 
 
 @pytest.fixture(scope="module")
@@ -238,3 +239,28 @@ def test_links_out_of_a_session_are_not_followed(folder, tmp_path, file):
     shutil.rmtree(copy)
     copy.symlink_to(tmp_path / "elsewhere" / "one")
     assert [s.id for s in dataset_export.open_sessions(copy.parent)[0]] == ["one"]
+
+
+def test_a_lerobot_dataset_has_an_image_and_a_pose_of_each_camera(tmp_path):
+    store = Store(tmp_path / "sessions", painted(), Limits())
+    cameras = [{"name": "wrist", "mount": "right_wrist", "pose": WRIST.tolist()}]
+    session = store.create({"seed": 3, "session": "one", "cameras": cameras})
+    made = step(store, session, 1)
+    step(store, store.create({"seed": 3, "session": "two"}), 1)
+    store.close()
+    sessions, _ = dataset_export.open_sessions(tmp_path / "sessions")
+    with pytest.raises(InputError, match="2 sets of further cameras"):
+        dataset_export.to_lerobot(sessions, tmp_path / "set")
+    dataset_export.to_lerobot(sessions[:1], tmp_path / "set")
+    (path,) = (tmp_path / "set" / "data").rglob("*.parquet")
+    table = pq.read_table(path).to_pydict()
+    images = [Image.open(io.BytesIO(p["bytes"])) for p in table["observation.images.wrist"]]
+    np.testing.assert_array_equal(np.stack(list(map(np.asarray, images))), made.others["wrist"])
+    poses = np.array(table["observation.camera.wrist.world_from_camera"]).reshape(-1, 4, 4)
+    hands = session.actions.wrists(session.rows(1))[:, 0]
+    np.testing.assert_allclose(poses, hands @ WRIST)
+    info = json.loads((tmp_path / "set" / "meta" / "info.json").read_text())
+    stats = json.loads((tmp_path / "set" / "meta" / "stats.json").read_text())
+    for name in ("observation.images.ego", "observation.images.wrist"):
+        assert info["features"][name]["dtype"] == "image"
+        assert stats[name]["count"] == [len(made.frames)]

@@ -9,6 +9,7 @@ from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.interactive.server.parts import Parts
 from egosim_jax.interactive.server.store import Store
 from egosim_jax.types import InputError
+from tests import painted as painting
 from tests.painted import VIDEO, ChunkPainter, PaintedWorld
 from tests.unit.interactive.server.served import run, step
 
@@ -126,3 +127,13 @@ def test_a_client_gives_parts_and_sees_each_before_it_gives_the_next(tmp_path):
         assert (session.step_id, done["info"]["chunk"]) == (1, 1)
         np.testing.assert_array_equal(np.concatenate(shown), done["frames"])
     service.store.close()
+
+
+def test_further_cameras_have_their_clip_after_the_last_part(store):
+    cameras = [{"name": "wrist", "mount": "right_wrist", "pose": painting.WRIST.tolist()}]
+    session = store.create({"seed": 3, "cameras": cameras})
+    given = rows(session)
+    assert not part(store, session, 1, given[:2]).others
+    done = part(store, session, 2, given[2:])
+    expected = step(store, store.create({"seed": 3, "cameras": cameras}), 1, given)
+    np.testing.assert_array_equal(done.others["wrist"], expected.others["wrist"])

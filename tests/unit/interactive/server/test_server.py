@@ -14,7 +14,7 @@ from egosim_jax.interactive.server import wire
 from egosim_jax.interactive.server.client import Client
 from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.types import InputError
-from tests.painted import VIDEO, PaintedWorld, Painter
+from tests.painted import VIDEO, WRIST, PaintedWorld, Painter
 from tests.unit.interactive.server.served import http, run
 
 
@@ -50,6 +50,29 @@ def test_two_clients_step_their_sessions_and_one_continues_the_others(server):
         one.close()
         with pytest.raises(RequestError, match="no session"):
             same.status()
+
+
+def test_a_reply_has_the_observed_frames_and_depth_of_further_cameras(server):
+    _, port = server
+    wrist = {"name": "wrist", "mount": "right_wrist", "pose": WRIST, "field_of_view_deg": 90}
+    with Client(f"ws://127.0.0.1:{port}") as client:
+        assert "right_wrist" in client.server["mounts"]
+        session = client.create(seed=3, cameras=[wrist], observe=["wrist.frames"])
+        declared = {**wrist, "pose": WRIST.tolist()}
+        assert session.reply["cameras"] == session.status()["cameras"] == [declared]
+        assert "frames" not in session.reply
+        rows, shown = np.tile(session.reply["row"], (4, 1)), []
+        observe = ["frames", "wrist.frames", "wrist.depth"]
+        reply = session.step(rows, observe=observe, show=shown.append)
+        np.testing.assert_array_equal(np.concatenate(shown), reply["frames"])
+        assert reply["wrist.frames"].shape == reply["frames"].shape
+        assert reply["wrist.depth"].shape == reply["frames"].shape[1:3]
+        assert reply["info"]["unobserved"].keys() == {"wrist"}
+        assert session.reset()["frames"].shape[0] == 1
+        with pytest.raises(RequestError, match=r"wrist\.frames, wrist\.depth"):
+            session.step(rows, observe=["side.frames"])
+        with pytest.raises(RequestError, match="at most 8 maps"):
+            client.create(cameras=[wrist] * 9)
 
 
 def test_a_client_that_vanishes_loses_nothing(server):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from egosim_jax.interactive.env.action_spec import ActionSpec
+from egosim_jax.interactive.env.chunks import make_chunk
 from egosim_jax.interactive.env.single import WorldEnv
 from egosim_jax.interactive.env.true_world import TrueWorld
 from egosim_jax.interactive.options import Limits
@@ -17,7 +18,7 @@ from egosim_jax.interactive.server.session import Session
 from egosim_jax.interactive.server.store import Store
 from egosim_jax.simulation.episode import Episode
 from egosim_jax.types import InputError
-from tests.painted import VIDEO, painted
+from tests.painted import SIDE, VIDEO, WRIST, painted
 from tests.unit.interactive.server.served import rows, step
 
 
@@ -219,3 +220,74 @@ def test_a_store_that_closes_at_once_gives_up_what_waits(tmp_path, monkeypatch):
     store.close(at_once=True)
     assert (one.committed, two.committed) == (1, 0)
     assert runs[0].result().step_id == 1
+
+
+CAMERAS = [
+    {"name": "wrist", "mount": "right_wrist", "field_of_view_deg": 90.0, "pose": WRIST.tolist()},
+    {"name": "side", "mount": "world", "pose": SIDE.tolist()},
+]
+
+
+def test_further_cameras_have_clips_that_a_restarted_store_reads(store):
+    session = store.create({"session": "one", "seed": 3, "cameras": CAMERAS})
+    alone = step(store, store.create({"seed": 3}), 1)
+    shape = (VIDEO.height, VIDEO.width, 3)
+    assert {name: f.shape for name, f in session.result.others.items()} == {
+        "wrist": (1, *shape),
+        "side": (1, *shape),
+    }
+    made = step(store, session, 1)
+    np.testing.assert_array_equal(made.frames, alone.frames)
+    assert made.info["state_sha256"] == alone.info["state_sha256"]
+    assert made.info["unobserved"].keys() == {"wrist", "side"}
+    assert not alone.others
+    store.close()
+    again = Store(store.folder, painted(), Limits())
+    kept = again.get("one")
+    assert kept.observer == session.observer
+    for name, frames in made.others.items():
+        np.testing.assert_array_equal(kept.result.others[name], frames)
+    again.close()
+
+
+def test_an_interrupted_step_keeps_the_clips_of_further_cameras(store, monkeypatch):
+    session = store.create({"session": "one", "seed": 3, "cameras": CAMERAS})
+    expected = step(store, store.create({"seed": 3, "cameras": CAMERAS}), 1)
+
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    chunk = make_chunk(session.actions, rows(session, 1), start=session.now, video=VIDEO)
+    session._accept(1, chunk, "hash")
+    with monkeypatch.context() as patched:
+        patched.setattr("egosim_jax.simulation.simulator.OpenClip.finish", stop)
+        with pytest.raises(KeyboardInterrupt):
+            session._run(1, None, None)
+    calls = []
+    paint = type(store.backend.generator).paint
+    monkeypatch.setattr(
+        type(store.backend.generator), "paint", lambda *a: calls.append(a) or paint(*a)
+    )
+    resumed = session.finish()
+    assert not calls  # all frames were on disk
+    for name, frames in expected.others.items():
+        np.testing.assert_array_equal(resumed.others[name], frames)
+    assert resumed.info == expected.info
+
+
+@pytest.mark.parametrize(
+    ("cameras", "message"),
+    [
+        ({}, "a list of at most 8 maps"),
+        ([{"name": "a"}], "a map of name, mount, pose"),
+        ([{**CAMERAS[0], "name": "ego"}], "not be 'ego', the main camera"),
+        ([{**CAMERAS[0], "mount": "left_wrist"}], "only the hands right"),
+        ([{**CAMERAS[0], "pose": "x"}], "4 rows of 4 finite numbers"),
+        ([{**CAMERAS[0], "field_of_view_deg": 300}], "from 5 to 150 degrees"),
+        ([CAMERAS[0], CAMERAS[0]], "Two cameras are named 'wrist'"),
+    ],
+)
+def test_a_bad_camera_makes_no_session(store, cameras, message):
+    with pytest.raises(InputError, match=message):
+        store.create({"cameras": cameras})
+    assert not list(store.folder.glob("[!.]*/session.json"))
