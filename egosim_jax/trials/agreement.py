@@ -23,7 +23,7 @@ from egosim_jax.worlds.tabletop import World, start_of_sequence
 
 MEASURES = {
     "prediction_cm": ("prediction - state, cm", "{:.1f}"),
-    "truth_cm": ("state - truth, cm", "{:.1f}"),
+    "truth_cm": ("state - true world, cm", "{:.1f}"),
     "clip": ("clip = state, %", "{:.0f}"),
 }
 DEFINITIONS = {
@@ -44,7 +44,8 @@ MOVED_M = 0.005
 def agreement(session: Session, goal: Goal, seed: int | None) -> dict[str, Any]:
     """Return the distances of a session's clips, and success in the true world.
 
-    `seed` is of a tabletop scene that only a model has seen; None: there is no other truth.
+    `seed` is of a tabletop scene whose clips a model makes; None: the state is the ground truth, or
+    there is no other world to compare with.
     """
     starts = list(session.runs())
     if not starts:
@@ -95,7 +96,7 @@ def _predicted(states: list[SceneState], actions: list[Action], fps: int) -> Ite
 def _distances_m(
     first: SceneState, states: list[SceneState], true: list[SceneState]
 ) -> Iterator[float]:
-    """Yield the distance in meters of each object that a state or the truth has moved."""
+    """Yield the distance in meters of each object that a state or the true world has moved."""
     for state, known in zip(states, true, strict=True):
         for number in objects_of(first):
             center = _center(first, number)

@@ -202,7 +202,7 @@ class ScriptedPolicy(Policy):
 
 @dataclass(frozen=True, kw_only=True)
 class Serving:
-    """How policy servers are reached."""
+    """Connection to policy servers."""
 
     sent: Mapping[str, str] = field(default_factory=lambda: dict(SENT))
     """Name of the part of an observation that each key has."""
@@ -211,7 +211,7 @@ class Serving:
 
 
 def parse(text: str, actions: ActionSpec, serving: Serving) -> Policy:
-    """Return the policy of NAME=POLICY or POLICY. Raises `InputError` if there is none."""
+    """Return the policy of NAME=POLICY or POLICY. Raises `InputError` for any other text."""
     name, separator, spec = text.partition("=")
     if not separator or "://" in name or ":" in name:
         name, spec = text, text

@@ -5,7 +5,7 @@
     trials/ID/...          the session (`interactive/server/session.py`)
 
 An interrupted trial begins again with its first clip: the policy is asked again, and clips whose
-rows are equal are read from the session. If a policy decides otherwise, the session is made anew.
+rows are equal are read from the session. If a policy decides otherwise, the session begins again.
 """
 
 from __future__ import annotations

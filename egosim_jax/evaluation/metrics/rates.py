@@ -20,7 +20,8 @@ import numpy as np
 DEFINITIONS = {
     "success": "percent of the trials that succeed; 95 % interval of Clopper and Pearson",
     "difference": "of success, over the trials that both policies made; its 95 % interval joins "
-    "those of Clopper and Pearson: of the share of pairs that differ, and of the better ones",
+    "the intervals of Clopper and Pearson of two shares: of pairs that differ, and of the better "
+    "ones among them",
     "p": "probability of at least such a difference by chance, if both policies are equally good: "
     "McNemar's exact test, two-sided",
 }

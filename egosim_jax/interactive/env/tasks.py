@@ -67,7 +67,7 @@ class Judged(NamedTuple):
     met: bool
     """True if the state meets the condition."""
     missing: float
-    """What is missing, in meters or radians."""
+    """Missing part of the minimum, in meters or radians."""
     broken: bool = False
     """True if the condition can no longer be met."""
 
@@ -103,7 +103,7 @@ class Goal:
     """True if success is known only after the last clip, because all conditions are to keep."""
 
     def __call__(self, outcome: Outcome) -> Reward:
-        """Return minus what is missing; success and a broken condition end the episode."""
+        """Return minus the missing parts; success and a broken condition end the episode."""
         return self.judge(outcome.first, outcome.step.state)
 
     def judge(self, first: SceneState, now: SceneState) -> Reward:
@@ -125,7 +125,7 @@ class Task:
     text: str
     """Text of the task, without an instruction."""
     conditions: tuple[Condition, ...]
-    """Conditions, all of which must be met."""
+    """Conditions that must be met together."""
     instruction: str = ""
     """Instruction for a policy; empty: made of the conditions."""
 
@@ -138,7 +138,7 @@ class Task:
     ) -> dict[str, Goal]:
         """Return the goal of the task in a scene by its text; with `any`, of each loose object.
 
-        There is none if the scene has not all objects, or no script that carries one (`carried`).
+        It is empty if the scene has not all objects, or no script that carries one (`carried`).
         """
         if not self._names_any:
             goal = self._goal(start, self.conditions, carried)
@@ -171,10 +171,11 @@ class Task:
                     return None
                 condition = carried
             numbers = [_number(state, name) for name in (condition.object, condition.other) if name]
-            if None in numbers:
+            present = [number for number in numbers if number is not None]
+            if len(present) < len(numbers):
                 return None
-            judges.append(_judge_of(condition, numbers, state, up))
-            texts = [objects_of(state)[number] for number in numbers if number is not None]
+            judges.append(_judge_of(condition, present, state, up))
+            texts = [objects_of(state)[number] for number in present]
             names = dict(zip(("object", "other"), texts, strict=False))
             words.append(INSTRUCTIONS[condition.kind].format(**names))
         named = {condition.object for condition in conditions} - {""}
@@ -299,7 +300,7 @@ def _opening(
 
 
 def _gap_m(state: SceneState, number: int, other: int, up: Float[np.ndarray, " 3"]) -> float:
-    """Return the distance in meters by which an object does not rest on another one; at most 0.
+    """Return the missing distance of an object to rest on another one, in meters; at most 0.
 
     Its center must be above the box around the other's points, and its lowest points at the top.
     """

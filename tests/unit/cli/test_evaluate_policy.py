@@ -1,4 +1,4 @@
-"""`egosim evaluate-policy`: the documented policy, and what is refused."""
+"""`egosim evaluate-policy`: the documented policy, and refused options."""
 
 import json
 import re

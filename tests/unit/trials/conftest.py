@@ -27,7 +27,7 @@ def outside(observation):
 
 
 def crashes(observation):
-    """Fail."""
+    """Raise an error of the policy."""
     raise ZeroDivisionError("of the policy")
 
 

@@ -133,7 +133,7 @@ def test_a_function_and_a_class_of_a_module_are_policies():
     assert conftest.Counting.resets == 2
 
 
-def test_trials_at_the_same_time_have_objects_of_their_own():
+def test_trials_at_the_same_time_have_separate_objects():
     counting = read(f"{MODULE}:Counting")
     with counting.agent(None, 0) as one, counting.agent(None, 0) as other:
         assert one.__self__ is not other.__self__

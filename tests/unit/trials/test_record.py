@@ -18,7 +18,7 @@ COLUMNS = ["next.reward", "next.success", "next.done", "action", "observation.st
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """Trials of two policies, one of which never gives an action that is allowed."""
+    """Trials of two policies; one never gives an action that is allowed."""
     out, world = tmp_path_factory.mktemp("policies"), painted()
     starts = read_starts(["tabletop:0-1"], VIDEO, no_dataset)
     tasks = [parse("keep away: any untouched")]

@@ -32,7 +32,7 @@ def test_success_has_intervals_and_differences_are_paired(folder):
     assert gap["low"] < 0 < gap["high"]
 
 
-def test_tasks_have_columns_of_their_own():
+def test_tasks_have_separate_columns():
     trials = [
         {**TRIAL, "policy": p, "group": g, "task": g, "success": s}
         for p, g, s in [("a", "x", True), ("a", "y", False), ("b", "x", False)]

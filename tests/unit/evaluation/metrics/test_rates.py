@@ -75,7 +75,7 @@ def test_a_difference_changes_its_sign_with_the_order():
     assert there["p"] == back["p"]
 
 
-def test_equal_policies_are_not_told_apart():
+def test_equal_policies_do_not_differ():
     found = difference([True] * 5, [True] * 5)
     assert (found["mean"], found["p"]) == (0, 1)
     assert found["low"] < -30
