@@ -60,10 +60,21 @@ def agreement(session: Session, goal: Goal, seed: int | None) -> dict[str, Any]:
     if seed is not None:
         true = list(_true_states(start.state, actions, seed, session))
         figures["truth_cm"] = _mean_cm(_distances_m(states[0], states[1:], true))
-        figures["true_success"] = any(goal.judge(states[0], state).success for state in true)
-        if goal.waits:
-            figures["true_success"] = goal.judge(states[0], true[-1]).success
+        figures["true_success"] = _succeeds(goal, states[0], true)
     return {name: value for name, value in figures.items() if value is not None}
+
+
+def _succeeds(goal: Goal, first: SceneState, states: list[SceneState]) -> bool | None:
+    """Return success in some states, as a trial has it; None if it does not follow from them."""
+    if goal.judge_of is not None:
+        return None
+    if goal.waits:
+        return all(goal.judge(first, state).success for state in states)
+    for state in states:
+        reward = goal.judge(first, state)
+        if reward.terminated:
+            return reward.success
+    return False
 
 
 def _mean_cm(distances_m: Iterator[float]) -> float | None:

@@ -22,7 +22,7 @@ from egosim_jax.io.bounded import quote, quote_text
 from egosim_jax.runtime.phases import hide_phases, phase
 from egosim_jax.runtime.progress import track
 from egosim_jax.simulation.start import Start, check_size
-from egosim_jax.trials.policies import Policy, ScriptedPolicy
+from egosim_jax.trials.policies import Policy, RowsError, ScriptedPolicy
 from egosim_jax.trials.starts import TrialStart, carried
 from egosim_jax.trials.trial import RESULT, Trial
 from egosim_jax.types import InputError
@@ -123,7 +123,7 @@ def run_all(
     """Make all trials, at most `batch` at once, and return their results.
 
     A trial whose policy fails, such as a server that ends, is reported; the same command makes it
-    again. A policy whose rows have the wrong length ends the run by an `InputError`.
+    again. Rows of the wrong length end the run by an `InputError`.
     """
     folder, stop = out / "trials", Event()
     made = sum((folder / trial.id / RESULT).exists() for trial in trials)
@@ -142,7 +142,7 @@ def run_all(
                 trial = futures[future]
                 if (error := future.exception()) is None:
                     results[trial.id] = future.result()
-                elif isinstance(error, Exception) and not isinstance(error, InputError):
+                elif isinstance(error, Exception) and not isinstance(error, RowsError):
                     words = f"{trial.policy.name}, {trial.task}, {trial.place}"
                     failed[words] = _reason(error)
                 else:

@@ -16,6 +16,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from queue import Empty, SimpleQueue
 from typing import Any, cast
 
@@ -45,8 +46,15 @@ OBSERVED = ("image", "frames", "row", "keypoints", "prompt", "chunk", "seed")
 SCRIPTED = ActionSpec(layout="keypoints", workspace_m=((-0.6, -0.4, -0.1), (0.6, 0.8, 0.6)))
 """Actions of scripted policies, whose hands leave the usual workspace."""
 
+TIMEOUT_S = 600.0
+"""Maximum time in seconds that a policy server may take for a reply."""
+
 Infer = Callable[[Mapping[str, Any]], Any]
 """Function from an observation to rows, {"actions": rows}, or None."""
+
+
+class RowsError(InputError):
+    """Error of actions of another kind than the run has: no trial of the policy can be made."""
 
 
 class Policy:
@@ -125,8 +133,19 @@ class ServedPolicy(Policy):
 
     def open(self) -> None:
         """Raise `InputError` unless the server can be reached."""
-        with self._connection():
-            pass
+        if missing := [name for name in ("websockets", "msgpack") if find_spec(name) is None]:
+            raise InputError(
+                f"A policy server needs {' and '.join(missing)}, not installed here: pip install "
+                "'egosim-jax[serve]'. (--policies)"
+            )
+        try:
+            with self._connection():
+                pass
+        except Exception as error:  # websockets has many kinds
+            raise InputError(
+                f"No policy server replies at {self._address}: {quote_text(str(error))}. Start it "
+                "first, or wait for it by --wait. (--policies)"
+            ) from error
 
     @contextmanager
     def _connection(self) -> Iterator[Any]:
@@ -135,14 +154,7 @@ class ServedPolicy(Policy):
 
         key = os.environ.get(KEY, "").strip()
         headers = {"Authorization": f"Api-Key {key}"} if key else None
-        try:
-            connection = connect(self._address, headers, wait_s=self._wait_s)
-        except Exception as error:  # websockets has many kinds
-            raise InputError(
-                f"No policy server listens at {self._address}: {quote_text(str(error))}. Start it "
-                "first, or wait for it by --wait. (--policies)"
-            ) from error
-        with connection as socket:
+        with connect(self._address, headers, wait_s=self._wait_s) as socket:
             _received(wire, socket)  # its metadata
             yield socket
 
@@ -163,7 +175,7 @@ class ServedPolicy(Policy):
 
 def _received(wire: Any, socket: Any) -> Any:
     """Return the next message of a policy server; a text is the traceback of its error."""
-    reply = socket.recv()
+    reply = socket.recv(timeout=TIMEOUT_S)
     if isinstance(reply, str):
         last = reply.strip().splitlines()[-1] if reply.strip() else "no message"
         raise RuntimeError(f"the policy server failed: {last}")
@@ -232,11 +244,11 @@ def parse(text: str, actions: ActionSpec, serving: Serving) -> Policy:
         )
     if isinstance(part, type) and callable(getattr(part, "infer", None)):
         return ObjectPolicy(name, spec, actions, part)
-    if callable(function := getattr(part, "infer", part)) and not isinstance(part, type):
-        return FunctionPolicy(name, spec, actions, function)
+    if callable(part) and not isinstance(part, type):
+        return FunctionPolicy(name, spec, actions, part)
     raise InputError(
         f"{spec} is {quote(part)}: a policy is a function of an observation, or a class with a "
-        "method infer. (--policies)"
+        "method infer. Name the class instead of an object of it. (--policies)"
     )
 
 
@@ -271,21 +283,23 @@ def rows_of(
 ) -> Float[np.ndarray, "k d"] | None:
     """Return the rows of a policy's reply for a clip, not checked for bounds; None to end.
 
-    More rows than a clip has frames are cut. Raises `InputError` for rows of another length, which
-    no trial can have.
+    More rows than a clip has frames are cut. Raises `RowsError` for rows of another length.
     """
     if isinstance(reply, Mapping):
         if "actions" not in reply:
-            raise InputError(
+            raise RowsError(
                 f"The policy returned a map of {quote(sorted(map(str, reply)))}: it must have "
                 "`actions`, rows of numbers. (--policies)"
             )
         reply = reply["actions"]
     if reply is None:
         return None
-    rows, width = to_numbers(reply), len(actions.names)
+    try:
+        rows, width = to_numbers(reply), len(actions.names)
+    except InputError as error:
+        raise RowsError(f"{error} (--policies)") from error
     if rows.ndim not in (1, 2) or rows.shape[-1] != width or not len(rows):
-        raise InputError(
+        raise RowsError(
             f"The policy returned actions of shape {rows.shape}: {actions.about} must have rows of "
             f"{width} numbers. Choose the actions that it was trained for (--actions, --hands), or "
             "convert them in a function of yours. (--policies)"

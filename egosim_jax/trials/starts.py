@@ -45,11 +45,11 @@ class TrialStart:
     """Seed of a tabletop scene; None for another scene."""
 
     def script(self, actions: ActionSpec, video: VideoSpec) -> Script | None:
-        """Return the script of a tabletop scene, if it carries an object."""
+        """Return the script of a tabletop scene, if it brings an object to a place."""
         if self.seed is None:
             return None
         script = next(make_scripts(self.seed, spec=video, kind=actions.kind))
-        return script if script.intent.verb == "carry" else None
+        return None if script.intent.goal_m is None else script
 
     def loose(self, start: Start, actions: ActionSpec, video: VideoSpec) -> list[str]:
         """Return the names of the objects that can be picked up; of an episode, all objects."""
@@ -60,8 +60,8 @@ class TrialStart:
 
 
 def carried(script: Script | None) -> Condition | None:
-    """Return the condition of a script's goal."""
-    if script is None:
+    """Return the condition that the object of a script is at its goal."""
+    if script is None or script.intent.goal_m is None:
         return None
     x, y, z = script.intent.goal_m - script.scene.body(script.intent.name).world_from_body[:3, 3]
     offset_m = float(x), float(y), float(z)

@@ -23,8 +23,8 @@ import numpy as np
 from jaxtyping import Float
 
 from egosim_jax.interactive.env.backends import Backend
-from egosim_jax.interactive.env.chunks import make_chunk, state_info
-from egosim_jax.interactive.env.rewards import Reward
+from egosim_jax.interactive.env.chunks import make_chunk, state_info, view_of
+from egosim_jax.interactive.env.rewards import Outcome, Reward
 from egosim_jax.interactive.env.tasks import Goal
 from egosim_jax.interactive.server.errors import RequestError
 from egosim_jax.interactive.server.requests import request_hash
@@ -32,10 +32,11 @@ from egosim_jax.interactive.server.session import DAMAGE, SETTINGS, Result, Sess
 from egosim_jax.io.bounded import quote_path, read_json
 from egosim_jax.io.run import write_json
 from egosim_jax.io.writing import write_frames
+from egosim_jax.simulation.simulator import Step
 from egosim_jax.simulation.start import Start
 from egosim_jax.trials.agreement import agreement
 from egosim_jax.trials.policies import Infer, Policy, rows_of
-from egosim_jax.types import InputError
+from egosim_jax.types import Clip, InputError
 from egosim_jax.worlds.tabletop import Script
 
 RESULT, VIDEO = "trial.json", "video.mp4"
@@ -107,8 +108,8 @@ class Trial:
                 if not isinstance(step, Result):
                     ended = step
                     break
+                rewards.append(self._judged(session, number, results[-1], step))
                 results.append(step)
-                rewards.append(self.goal.judge(self.start.state, step.state))
                 if rewards[-1].terminated:
                     ended = "success" if rewards[-1].success else "broken"
                     break
@@ -129,6 +130,19 @@ class Trial:
         except InputError as error:
             return f"refused: {error}"
         return session.commit(number, chunk, request)
+
+    def _judged(self, session: Session, number: int, before: Result, step: Result) -> Reward:
+        """Return the reward of a clip."""
+        if self.goal.judge_of is None:
+            return self.goal.judge(self.start.state, step.state)
+        simulator = session.backend.simulator(session.now)
+        made = Step(
+            view=view_of(simulator, before.state, session.action(number).cameras),
+            clip=Clip(frames=step.frames, fps=session.backend.video.fps),
+            state=step.state,
+            notes=tuple(step.info["notes"]),
+        )
+        return self.goal(Outcome(first=self.start.state, step=made))
 
     def _observation(self, session: Session, number: int, last: Result) -> dict[str, Any]:
         frames, count = last.frames, session.backend.video.frames

@@ -6,7 +6,10 @@
     red box onto white box          it rests on the other object, in no hand
     green chest open by 30 deg      turned, or with a length moved, relative to its case
     red cone untouched              moved by at most 1 cm; else the trial ends
-    carry                           the object of a tabletop scene's script is at its goal
+    carry                           the object that a tabletop scene's script moves is at its goal
+
+    MODULE:NAME                     a reward function of your own (`rewards.RewardFn`), such as a
+                                    judge that looks at the clip
 
 Conditions are joined by " and ". An object is a name or an id of the state. "any" is each object
 that can be picked up, one task for each. An instruction for the policy may come first: "pick up the
@@ -18,18 +21,30 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, no_type_check
+from typing import Any, NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float
 
 from egosim_jax.geometry import invert, rotation_angles_deg
-from egosim_jax.interactive.env.rewards import Outcome, Reward, displacement_m
+from egosim_jax.interactive.env.rewards import (
+    Outcome,
+    Reward,
+    RewardFn,
+    check_callable,
+    check_reward,
+    displacement_m,
+    judge,
+)
 from egosim_jax.io.bounded import quote, quote_text
+from egosim_jax.runtime.registry import Registry
 from egosim_jax.simulation.start import Start
 from egosim_jax.state.planes import vertical
 from egosim_jax.types import InputError, SceneState
 
+JUDGES: Registry[Any] = Registry(kind="judge", option="--tasks", group="egosim_jax.judges")
+NAMED = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+"""Name of a reward function."""
 CARRY, ANY = "carry", "any"
 GOAL_M = 0.02
 """Maximum distance to the goal of an object, in meters."""
@@ -101,13 +116,17 @@ class Goal:
     """Judgment of each condition from the first and the present state."""
     waits: bool
     """True if success is known only after the last clip, because all conditions are to keep."""
+    judge_of: RewardFn | None = None
+    """Reward function in place of conditions; it may look at the clip."""
 
     def __call__(self, outcome: Outcome) -> Reward:
         """Return minus the missing parts; success and a broken condition end the episode."""
+        if self.judge_of is not None:
+            return judge(self.judge_of, outcome)
         return self.judge(outcome.first, outcome.step.state)
 
     def judge(self, first: SceneState, now: SceneState) -> Reward:
-        """Return the reward of a state."""
+        """Return the reward of a state, by the conditions."""
         judged = [condition(first, now) for condition in self.conditions]
         success = all(judgment.met for judgment in judged)
         broken = any(judgment.broken for judgment in judged)
@@ -128,6 +147,8 @@ class Task:
     """Conditions that must be met together."""
     instruction: str = ""
     """Instruction for a policy; empty: made of the conditions."""
+    judge_of: RewardFn | None = None
+    """Reward function in place of conditions."""
 
     @property
     def _names_any(self) -> bool:
@@ -140,6 +161,11 @@ class Task:
 
         It is empty if the scene has not all objects, or no script that carries one (`carried`).
         """
+        if self.judge_of is not None:
+            check_reward(self.judge_of, start)
+            instruction = self.instruction or self.text
+            seen = Goal(instruction=instruction, conditions=(), waits=False, judge_of=self.judge_of)
+            return {self.text: seen}
         if not self._names_any:
             goal = self._goal(start, self.conditions, carried)
             return {} if goal is None else {self.text: goal}
@@ -190,6 +216,12 @@ class Task:
 def parse(text: str) -> Task:
     """Return the task of a text. Raises `InputError` with the forms if it is not one."""
     instruction, _, conditions = text.rpartition(": ")
+    if NAMED.fullmatch(conditions.strip()):
+        name = conditions.strip()
+        reward = JUDGES.get(name)
+        reward = reward() if isinstance(reward, type) else reward
+        check_callable(reward)
+        return Task(text=name, conditions=(), instruction=instruction.strip(), judge_of=reward)
     parts = [part.strip() for part in re.split(r"\s+and\s+", conditions.strip())]
     return Task(
         text=" and ".join(parts),
@@ -220,9 +252,9 @@ def _condition(text: str) -> Condition:
             offset_m=(offset[0], offset[1], offset[2]),
         )
     raise InputError(
-        f"There is no task {quote(text)}: it must be carry, or an object followed by `moved by 10 "
-        "cm`, `moved by X,Y,Z`, `lifted by 10 cm`, `onto OTHER`, `open by 30 deg` or `untouched`, "
-        "such as 'red box lifted by 10 cm'. Join several by ' and '. (--tasks)"
+        f"There is no task {quote(text)}: it must be carry, MODULE:NAME, or an object "
+        "followed by `moved by 10 cm`, `moved by X,Y,Z`, `lifted by 10 cm`, `onto OTHER`, `open by "
+        "30 deg` or `untouched`, such as 'red box lifted by 10 cm'. Join several by ' and '. (--tasks)"
     )
 
 

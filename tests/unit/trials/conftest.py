@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from egosim_jax.interactive.env import ActionSpec
+from egosim_jax.interactive.env.rewards import Reward
 from egosim_jax.interactive.env.true_world import TrueWorld
 from egosim_jax.trials import policies
 from egosim_jax.types import VideoSpec
@@ -50,6 +51,13 @@ class Counting:
         """Return rows, twice."""
         self.left -= 1
         return None if self.left < 0 else np.repeat(observation["row"][None], 3, axis=0)
+
+
+def bright(outcome):
+    """Judge a clip by its pixels, and the state by its first one."""
+    frames = outcome.step.clip.frames
+    seen = outcome.step.view.frames.shape == frames.shape
+    return Reward(reward=float(frames.mean()), success=bool(seen and frames.mean() > 10))
 
 
 def no_dataset(root, number, video):

@@ -11,7 +11,7 @@ import websockets.sync.server
 
 from egosim_jax.interactive.env import ActionSpec
 from egosim_jax.trials import policies
-from egosim_jax.trials.policies import Serving, parse, parse_all, parse_sent, rows_of
+from egosim_jax.trials.policies import RowsError, Serving, parse, parse_all, parse_sent, rows_of
 from egosim_jax.types import InputError
 from tests.unit.trials import conftest
 
@@ -114,6 +114,14 @@ def test_an_error_of_the_server_is_its_last_line():
     server.server.shutdown()
 
 
+def test_a_server_that_ends_fails_the_trial_alone(server):
+    policy = read(f"openpi:127.0.0.1:{server.port}")
+    policy.open()
+    server.server.shutdown()
+    with pytest.raises(ConnectionRefusedError), policy.agent(None, 0):
+        pass
+
+
 def test_a_server_that_does_not_listen_is_refused_before_work():
     with pytest.raises(InputError, match="--policies"):
         read("openpi:127.0.0.1:9").open()
@@ -196,7 +204,7 @@ def test_none_ends_a_trial():
     "reply", [np.zeros((3, 5)), np.zeros((0, 7)), np.zeros((1, 1, 7)), {"action": 1}, "row", 3.0]
 )
 def test_other_replies_are_refused(reply):
-    with pytest.raises(InputError):
+    with pytest.raises(RowsError):
         rows_of(reply, SPEC, SPEC.rest, 17)
 
 

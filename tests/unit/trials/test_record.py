@@ -7,6 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from egosim_jax.interactive.env.tasks import parse
+from egosim_jax.interactive.server.dataset_export import open_sessions
 from egosim_jax.trials.evaluation import plan, run_all
 from egosim_jax.trials.record import write_datasets
 from egosim_jax.trials.starts import read_starts
@@ -58,6 +59,13 @@ def test_its_tasks_are_the_instructions(made):
     assert tasks["__index_level_0__"] == ["keep away"]
     stats = json.loads((folder / "meta" / "stats.json").read_text())
     assert stats["next.done"]["max"] == [1.0]
+
+
+def test_trials_are_sessions_that_can_be_exported(made):
+    out, _, finished, _ = made
+    sessions, damaged = open_sessions(out / "trials")
+    assert {session.id for session in sessions} == {t["id"] for t in finished if t["clips"]}
+    assert not damaged
 
 
 def test_a_dataset_is_written_again_only_for_other_trials(made):
