@@ -24,7 +24,7 @@ from egosim_jax.types import InputError, VideoSpec, check_seed
 from egosim_jax.worlds.tabletop import Script, make_scripts
 
 TABLETOP = "tabletop"
-MAX_STARTS = 10_000
+MAX_STARTS = 1000
 """Maximum number of starts that one text may name."""
 RANGE = re.compile(r"(\d{1,18})(?:-(\d{1,18}))?")
 

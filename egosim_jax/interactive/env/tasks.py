@@ -254,7 +254,8 @@ def _condition(text: str) -> Condition:
     raise InputError(
         f"There is no task {quote(text)}: it must be carry, MODULE:NAME, or an object "
         "followed by `moved by 10 cm`, `moved by X,Y,Z`, `lifted by 10 cm`, `onto OTHER`, `open by "
-        "30 deg` or `untouched`, such as 'red box lifted by 10 cm'. Join several by ' and '. (--tasks)"
+        "30 deg` or `untouched`, such as 'red box lifted by 10 cm'. Join several by ' and '. "
+        "(--tasks)"
     )
 
 

@@ -15,7 +15,7 @@ from egosim_jax.runtime.command import CommandExit, ExitCode
 from egosim_jax.types import InputError, VideoSpec
 
 ROOT = Path(__file__).parents[3]
-VIDEO = VideoSpec(frames=17, height=24, width=40, fps=8)
+VIDEO = VideoSpec(frames=17, height=8, width=16, fps=8)
 PAGE = (ROOT / "docs" / "policies.md").read_text("utf-8")
 (POLICY,) = re.findall(r"(?<=\n\n)((?: {4}.*\n|\n)+)(?=It lifts)", PAGE)
 

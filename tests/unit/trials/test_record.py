@@ -1,11 +1,14 @@
 """Trials as LeRobot datasets."""
 
 import json
+from functools import partial
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from egosim_jax.annotate.lerobot_episode import episode_from_lerobot
+from egosim_jax.interactive.env import ActionSpec
 from egosim_jax.interactive.env.tasks import parse
 from egosim_jax.interactive.server.dataset_export import open_sessions
 from egosim_jax.trials.evaluation import plan, run_all
@@ -66,6 +69,19 @@ def test_trials_are_sessions_that_can_be_exported(made):
     sessions, damaged = open_sessions(out / "trials")
     assert {session.id for session in sessions} == {t["id"] for t in finished if t["clips"]}
     assert not damaged
+
+
+def test_trials_begin_from_the_first_frames_of_a_dataset(made):
+    _, world, finished, (folder,) = made
+    read = partial(episode_from_lerobot, clips=1)
+    (start,) = read_starts([f"{folder}:2"], VIDEO, read)
+    begun = start.begin(world, ActionSpec())
+    scene = world.start(1, ActionSpec())
+    assert finished[4]["start"] == "tabletop:1"
+    np.testing.assert_array_equal(begun.state.points_m, scene.state.points_m)
+    np.testing.assert_allclose(
+        begun.camera.world_from_camera, scene.camera.world_from_camera, atol=1e-6
+    )
 
 
 def test_a_dataset_is_written_again_only_for_other_trials(made):
