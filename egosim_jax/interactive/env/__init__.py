@@ -11,6 +11,7 @@ new frame of a clip. Sessions of remote clients are in `server`. Needs the extra
 - `ActionSpec`: layout and bounds of action rows.
 - `Start`: scene, camera and hands from which an episode continues.
 - `rewards`: `Reward`, `MoveObject`, `GoalImage`.
+- `tasks`: tasks as text, such as "red box lifted by 10 cm", judged by the state.
 """
 
 from __future__ import annotations
