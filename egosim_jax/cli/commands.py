@@ -12,6 +12,7 @@ from egosim_jax.cli.data import Data
 from egosim_jax.cli.doctor import Doctor
 from egosim_jax.cli.episode import Episode
 from egosim_jax.cli.evaluate import Evaluate
+from egosim_jax.cli.evaluate_policy import EvaluatePolicy
 from egosim_jax.cli.experiment import Experiment
 from egosim_jax.cli.generate import Generate
 from egosim_jax.cli.models import Models
@@ -35,6 +36,7 @@ Commands = command.subcommands(
         "serve": Serve,
         "view": View,
         "evaluate": Evaluate,
+        "evaluate-policy": EvaluatePolicy,
         "table": TableCommand,
         "rank": Rank,
         "data": Data,

@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any, no_type_check
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int, Shaped, UInt8
 from PIL import Image
 
 from egosim_jax.io.atomic import atomic_folder
@@ -72,8 +72,8 @@ class ClipRecord:
     """Cameras, joints of the hands and caption of the clip."""
     images: Mapping[str, UInt8[np.ndarray, "f h w 3"]] = field(default_factory=dict)
     """Frames of further cameras, by the name of their feature (`image_feature`)."""
-    others: Mapping[str, Float[np.ndarray, "f _"]] = field(default_factory=dict)
-    """Other vectors of each frame, by the name of their feature."""
+    others: Mapping[str, Shaped[np.ndarray, "f ..."]] = field(default_factory=dict)
+    """Other vectors or numbers of each frame, by the name of their feature."""
 
 
 @no_type_check
@@ -94,7 +94,7 @@ class _Totals:
     frames: int = 0
     sizes: set[tuple[int, ...]] = field(default_factory=set)
     images: tuple[str, ...] = ()
-    vectors: dict[str, int] = field(default_factory=dict)
+    vectors: dict[str, dict[str, Any]] = field(default_factory=dict)
     statistics: dict[str, list[dict[str, np.ndarray]]] = field(default_factory=dict)
 
 
@@ -189,7 +189,7 @@ def _numbers(clip: ClipRecord, frame: int) -> dict[str, np.ndarray]:
         HANDS: clip.action.joints_m[frame].astype(float).ravel(),
         POSES: np.asarray(cameras.world_from_camera[frame], float).ravel(),
         INTRINSICS: np.asarray(cameras.intrinsics_px, float).ravel(),
-        **{name: np.asarray(values[frame], float) for name, values in clip.others.items()},
+        **{name: np.asarray(values[frame]) for name, values in clip.others.items()},
     }
 
 
@@ -219,8 +219,9 @@ def _write_episode(
     for name, of_image in counted.items():
         totals.statistics.setdefault(name, []).append(image_statistics(of_image))
     for name, values in vectors.items():
-        totals.vectors[name] = values.shape[1]
-        totals.statistics.setdefault(name, []).append(vector_statistics(values.astype(float)))
+        totals.vectors[name] = {"dtype": values.dtype.name, "shape": list(values.shape[1:]) or [1]}
+        table = values.reshape(len(values), -1).astype(float)
+        totals.statistics.setdefault(name, []).append(vector_statistics(table))
     count, first = len(steps), totals.frames
     columns = {
         **images,
@@ -289,8 +290,8 @@ def _write_meta(
     (size,) = totals.sizes
     vector = {"dtype": "float32", "shape": [len(names)], "names": list(names)}
     exact = {
-        name: {"dtype": "float64", "shape": [length], "names": None}
-        for name, length in totals.vectors.items()
+        name: {**feature, "names": None}
+        for name, feature in totals.vectors.items()
         if name not in (STATE, ACTION)
     }
     image = {"dtype": "image", "shape": [*size, 3], "names": ["height", "width", "channels"]}

@@ -8,7 +8,7 @@ escapes every value.
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from importlib.util import find_spec
 from itertools import islice
@@ -64,16 +64,35 @@ def write_page(
     evaluation: Evaluation, methods: Sequence[Method], path: Path, *, title: str, clips: int
 ) -> None:
     """Write the page of an evaluation, with at most `clips` clips of each group."""
-    import jinja2
-
-    template = resources.files("egosim_jax.evaluation").joinpath(TEMPLATE).read_text("utf-8")
-    page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    text = page.from_string(template).render(
+    render(
+        path,
         title=title,
         tables=list(_tables(evaluation)),
         notes=evaluation.notes(),
         skipped=list(evaluation.skipped),
         clips=list(_clips(evaluation, methods, clips)),
+    )
+
+
+def render(
+    path: Path,
+    *,
+    title: str,
+    tables: Sequence[Mapping[str, Any]],
+    notes: Sequence[str],
+    skipped: Sequence[str],
+    clips: Sequence[ShownClip],
+) -> None:
+    """Write a page of tables, notes, what was skipped, and clips.
+
+    A table has `caption`, `corner`, `heads` and `rows`, and `differences` from a `reference`.
+    """
+    import jinja2
+
+    template = resources.files("egosim_jax.evaluation").joinpath(TEMPLATE).read_text("utf-8")
+    page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+    text = page.from_string(template).render(
+        title=title, tables=tables, notes=notes, skipped=skipped, clips=clips
     )
     write_text(path, text)
 
@@ -83,7 +102,8 @@ def _tables(evaluation: Evaluation) -> Iterator[dict[str, Any]]:
     for group in evaluation.summaries():
         columns = evaluation.headings(group)
         yield {
-            "caption": evaluation.caption(group),
+            "corner": "method",
+            "caption": f"{evaluation.caption(group)}: mean ± spread over clips",
             "heads": [f"{c.heading} {ARROWS[c.better]}" for c in columns.values()],
             "rows": [
                 (
@@ -93,7 +113,7 @@ def _tables(evaluation: Evaluation) -> Iterator[dict[str, Any]]:
                 )
                 for title, row in evaluation.table(group).items()
             ],
-            "reference": next(iter(evaluation.titles.values())),
+            "reference": f"{next(iter(evaluation.titles.values()))} on the same clips",
             "differences": [
                 (
                     evaluation.titles[method],
@@ -119,12 +139,11 @@ def _clips(evaluation: Evaluation, methods: Sequence[Method], count: int) -> Ite
         shown = [by_name[row.method] for row in rows if not row.own]
         frames, fps = _strip(window, shown, rows[0].shape)
         columns = evaluation.headings(group)
-        data = base64.b64encode(encode_video(frames, fps, crf=CRF)).decode()
         yield ShownClip(
             title=f"{evaluation.groups.get(group, group)}: {window.output_id}",
             prompt=window.files.prompt,
             names=[*(method.title for method in shown), "ground truth"],
-            video=f"data:video/mp4;base64,{data}",
+            video=as_uri(frames, fps),
             scores=[
                 [evaluation.titles[row.method]]
                 + [c.form.format(row.scores[k]) if k in row.scores else "" for k, c in
@@ -132,6 +151,24 @@ def _clips(evaluation: Evaluation, methods: Sequence[Method], count: int) -> Ite
                 for row in rows
             ],
         )  # fmt: skip
+
+
+def as_uri(frames: UInt8[np.ndarray, "f h w 3"], fps: float) -> str:
+    """Return a video as a data URI."""
+    data = base64.b64encode(encode_video(frames, fps, crf=CRF)).decode()
+    return f"data:video/mp4;base64,{data}"
+
+
+def columns_of(
+    videos: Sequence[UInt8[np.ndarray, "_ _ _ 3"]], height: int, width: int
+) -> UInt8[np.ndarray, "_ _ _ 3"]:
+    """Return every second frame of videos in columns of `PANEL_PX`; a short one holds its last."""
+    rows = round(PANEL_PX * height / width / 2) * 2
+    panels = [resize_video(np.ascontiguousarray(v[::EVERY]), rows, PANEL_PX) for v in videos]
+    longest = max(map(len, panels))
+    holds = [((0, longest - len(panel)), (0, 0), (0, 0), (0, 0)) for panel in panels]
+    held = [np.pad(panel, hold, "edge") for panel, hold in zip(panels, holds, strict=True)]
+    return np.concatenate(held, axis=2)
 
 
 def _strip(
@@ -142,9 +179,6 @@ def _strip(
     if target_path is None:
         raise InputError(f"{window.files.row} has no ground truth. (column video)")
     target = read_at(target_path, shape, window.start)
-    height = round(PANEL_PX * shape.height / shape.width / 2) * 2
-    panels = [
-        resize_video(np.ascontiguousarray(video[::EVERY]), height, PANEL_PX)
-        for video in (*(m.video(window, shape, target) for m in methods), target)
-    ]
-    return np.concatenate(panels, axis=2), float(probe_video(target_path).fps) / EVERY
+    videos = [*(method.video(window, shape, target) for method in methods), target]
+    frames = columns_of(videos, shape.height, shape.width)
+    return frames, float(probe_video(target_path).fps) / EVERY

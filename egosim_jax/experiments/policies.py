@@ -13,6 +13,7 @@ from jaxtyping import UInt8
 
 from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.evaluation.metrics import rank_correlation, region
+from egosim_jax.evaluation.metrics.rates import rate
 from egosim_jax.evaluation.metrics.report import print_table
 from egosim_jax.experiments.config import Policies
 from egosim_jax.experiments.report import Table, cached, plot, write_report
@@ -50,6 +51,7 @@ Outcome = dict[str, float]
 Judge = Callable[["Task", Action, np.ndarray], Outcome]
 """Function that measures the outcome of an action, with its generated frames."""
 DEFINITIONS = {
+    "low, high of success": "95 % interval of Clopper and Pearson",
     "true": "share of scenes in which the executed action leaves the object within 3 cm of the "
     "goal horizontally and 2 cm vertically",
     "seen, frames": "the same by the ground-truth and by the generated frames: the centroid of the "
@@ -221,7 +223,7 @@ def _report(out: Path, outcomes: Mapping[str, Sequence[Mapping[str, Outcome]]]) 
     true, judges = success["true"], [key for key in success if key != "true"]
     rows: Table = {
         policy.name: {
-            key: {"mean": 100 * float(shares[row].mean())} for key, shares in success.items()
+            key: rate(int(shares[row].sum()), shares.shape[1]) for key, shares in success.items()
         }
         for row, policy in enumerate(POLICIES)
     }

@@ -9,6 +9,7 @@ from itertools import islice
 import numpy as np
 
 from egosim_jax.evaluation.metrics.rank_correlation import spearman
+from egosim_jax.evaluation.metrics.rates import rate
 from egosim_jax.evaluation.metrics.report import paired_difference, print_table
 from egosim_jax.experiments.config import Rank
 from egosim_jax.experiments.report import cached, write_report
@@ -102,16 +103,9 @@ def candidates(seed: int, spec: VideoSpec, number: int) -> list[TabletopClip]:
 
 def _summary(goals: Sequence[dict], method: str) -> dict[str, dict[str, float]]:
     """Return top-1 accuracy and Spearman correlation of a method, with intervals."""
-    from scipy.stats import binomtest
-
     hits = sum(int(np.argmax(goal[method])) == goal["best"] for goal in goals)
-    interval = binomtest(hits, len(goals)).proportion_ci()
     correlations = [spearman(*map(np.asarray, (goal[method], goal["target"]))) for goal in goals]
     return {
-        "top1": {
-            "mean": 100 * hits / len(goals),
-            "low": 100 * float(interval.low),
-            "high": 100 * float(interval.high),
-        },
+        "top1": rate(hits, len(goals)),
         "spearman": paired_difference(correlations, np.zeros(len(goals)).tolist()),
     }

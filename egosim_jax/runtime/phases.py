@@ -41,6 +41,18 @@ def show_phases() -> Iterator[None]:
 
 
 @contextmanager
+def hide_phases() -> Iterator[None]:
+    """Hide the phases of this process inside the context, where many at once would be noise."""
+    with _Shown.lock:
+        depth, _Shown.depth = _Shown.depth, 0
+    try:
+        yield
+    finally:
+        with _Shown.lock:
+            _Shown.depth += depth
+
+
+@contextmanager
 def phase(text: str, *, only_if_long: bool = False) -> Iterator[None]:
     """Show a phase, if phases are shown, while the context is open.
 

@@ -13,5 +13,6 @@ Reading files, choosing frames and writing reports belong to `evaluation`.
     state_update      accuracy of a scene state after a move
     rank_correlation  Pearson, Spearman, MMRV
     loop              all measures of one simulator step
+    rates             success of few trials: exact intervals, paired differences
     report            means, spreads, paired differences, printed tables
 """

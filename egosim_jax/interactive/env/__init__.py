@@ -12,6 +12,7 @@ new frame of a clip. Sessions of remote clients are in `server`. Needs the extra
 - `MountedCamera`: further camera, fixed in the world, on the head or on a wrist.
 - `Start`: scene, camera and hands from which an episode continues.
 - `rewards`: `Reward`, `MoveObject`, `GoalImage`.
+- `tasks`: tasks as text, such as "red box lifted by 10 cm", judged by the state.
 """
 
 from __future__ import annotations

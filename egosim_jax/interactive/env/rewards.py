@@ -26,12 +26,17 @@ class Outcome:
 
     def displacement_m(self, number: int) -> Float[np.ndarray, " 3"]:
         """Return the displacement of an object's center since the start, in meters."""
-        pose = np.asarray(self.step.state.world_from_object.get(number, np.eye(4)), float)
-        before = np.asarray(self.first.world_from_object.get(number, np.eye(4)), float)
-        check_object(self.first, number)
-        points = self.first.points_m[self.first.object_ids == number]
-        center = np.append(points.astype(float).mean(axis=0), 1)
-        return (pose @ np.linalg.inv(before) @ center - center)[:3]
+        return displacement_m(self.first, self.step.state, number)
+
+
+def displacement_m(first: SceneState, now: SceneState, number: int) -> Float[np.ndarray, " 3"]:
+    """Return the displacement of an object's center between two states, in meters."""
+    pose = np.asarray(now.world_from_object.get(number, np.eye(4)), float)
+    before = np.asarray(first.world_from_object.get(number, np.eye(4)), float)
+    check_object(first, number)
+    points = first.points_m[first.object_ids == number]
+    center = np.append(points.astype(float).mean(axis=0), 1)
+    return (pose @ np.linalg.inv(before) @ center - center)[:3]
 
 
 @dataclass(frozen=True, kw_only=True)

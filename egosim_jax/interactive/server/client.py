@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -47,7 +47,8 @@ class Client:
         for up to `patience_s`.
         """
         self._timeout_s, self._patience_s = timeout_s, patience_s
-        self._connection = _connect(address, token, wait_s=wait)
+        headers = {"Authorization": f"Bearer {token}"} if token else None
+        self._connection = connect(address, headers, wait_s=wait)
         self._socket = self._connection.__enter__()
         self.server: dict[str, Any] = wire.unpack(self._received())
         """Description of the server: world, size and rate of its clips, limits."""
@@ -117,7 +118,7 @@ class Client:
         return RemoteSession(self, {**status, "step_id": status["committed_step_id"]})
 
 
-def _connect(address: str, token: str | None, *, wait_s: float) -> Any:
+def connect(address: str, headers: Mapping[str, str] | None, *, wait_s: float) -> Any:
     """Return the connection to a server, which may start meanwhile."""
     import websockets.sync.client
 
@@ -128,7 +129,7 @@ def _connect(address: str, token: str | None, *, wait_s: float) -> Any:
                 address.replace("http", "ws", 1) if address.startswith("http") else address,
                 compression=None,
                 max_size=None,
-                additional_headers={"Authorization": f"Bearer {token}"} if token else None,
+                additional_headers=headers,
                 ping_timeout=None,
             )
         except ConnectionRefusedError:  # nothing listens at the address yet

@@ -399,6 +399,10 @@ class Session:
         first = self._start(FIRST)
         return self._load_start(first if first.exists() else self._start(0))
 
+    def first_result(self) -> Result:
+        """Return the result with which the session was created; it has only the first frame."""
+        return self._reset_result(self.first_start())
+
     @property
     def saved(self) -> list[str]:
         """Names of the saved starts."""
