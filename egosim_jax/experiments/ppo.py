@@ -7,7 +7,7 @@ their own. An episode is one step, so there is nothing to discount.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from gymnasium.vector import VectorEnv
@@ -48,7 +48,7 @@ def by_stable_baselines3(
         seed=seed,
         device="cpu",
     )
-    last = model.policy.action_net
+    last: Any = model.policy.action_net
     with torch.no_grad():
         last.weight.copy_(torch.as_tensor(weights[:-1].T))
         last.bias.copy_(torch.as_tensor(weights[-1]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, no_type_check, runtime_checkable
+from typing import Any, Protocol, cast, no_type_check, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -101,7 +101,7 @@ def reward_of(reward: Any) -> RewardFn:
             f"The reward is {quote(given)}: it must be MoveObject, GoalImage, a function of an "
             "Outcome that returns a Reward, or the MODULE:NAME of one. (reward)"
         )
-    return reward
+    return cast(RewardFn, reward)
 
 
 def judge(reward: RewardFn, outcome: Outcome) -> Reward:

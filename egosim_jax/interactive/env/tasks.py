@@ -21,7 +21,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, no_type_check
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -31,18 +31,16 @@ from egosim_jax.interactive.env.rewards import (
     Outcome,
     Reward,
     RewardFn,
-    check_callable,
     check_reward,
     displacement_m,
     judge,
+    reward_of,
 )
 from egosim_jax.io.bounded import quote, quote_text
-from egosim_jax.runtime.registry import Registry
 from egosim_jax.simulation.start import Start
 from egosim_jax.state.planes import vertical
 from egosim_jax.types import InputError, SceneState
 
-JUDGES: Registry[Any] = Registry(kind="judge", option="--tasks", group="egosim_jax.judges")
 NAMED = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 """Name of a reward function."""
 CARRY, ANY = "carry", "any"
@@ -218,10 +216,9 @@ def parse(text: str) -> Task:
     instruction, _, conditions = text.rpartition(": ")
     if NAMED.fullmatch(conditions.strip()):
         name = conditions.strip()
-        reward = JUDGES.get(name)
-        reward = reward() if isinstance(reward, type) else reward
-        check_callable(reward)
-        return Task(text=name, conditions=(), instruction=instruction.strip(), judge_of=reward)
+        return Task(
+            text=name, conditions=(), instruction=instruction.strip(), judge_of=reward_of(name)
+        )
     parts = [part.strip() for part in re.split(r"\s+and\s+", conditions.strip())]
     return Task(
         text=" and ".join(parts),

@@ -78,7 +78,7 @@ class WorldVectorEnv(VectorEnv):
         self.num_envs, self.backend, self.actions = num_envs, backend, actions or ActionSpec()
         self._observe, self._max_chunks = tuple(observe), max_chunks
         single = callable(reward) or isinstance(reward, str)
-        given = [reward] * num_envs if single else list(reward)
+        given = [reward] * num_envs if single else list(cast(Sequence[RewardFn | str], reward))
         if len(given) != num_envs:
             raise InputError(
                 f"{len(given)} rewards for {num_envs} episodes: give one, or one for each."

@@ -58,7 +58,7 @@ class FlatVectorEnv(VectorWrapper):
     unless it has a seed for each episode. `info["scene"]` has the seeds.
     """
 
-    env: WorldVectorEnv
+    env: WorldVectorEnv  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(self, envs: WorldVectorEnv, skill: Skill, *, scenes: Sequence[int]):
         super().__init__(envs)

@@ -7,7 +7,6 @@ to turn the hand. One clip is one episode.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -37,8 +36,15 @@ class Lift:
     height_m: float = 0.05
     """Rise of the object's center that counts as success, in meters."""
 
-    observed: ClassVar[int] = 6
-    acted: ClassVar[int] = 5
+    @property
+    def observed(self) -> int:
+        """Count of the numbers of a place and a size."""
+        return 6
+
+    @property
+    def acted(self) -> int:
+        """Count of the numbers of an action: a place, how far the hand closes, and its turn."""
+        return 5
 
     def observe(self, running: RunningEpisode) -> Float[np.ndarray, " 6"]:
         """Return place and size of the object at the start, each about from -1 to 1."""

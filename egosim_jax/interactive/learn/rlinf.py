@@ -19,14 +19,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from egosim_jax.interactive.env import load_backend, make_vec
 from egosim_jax.interactive.env.rewards import Outcome, Reward, RewardFn, judge, reward_of
 from egosim_jax.types import InputError
+
+if TYPE_CHECKING:
+    import torch
 
 NAME = "egosim_jax"
 """Value of `simulator` in the config of an environment."""
@@ -70,6 +72,8 @@ class RLinfEnv:
         self.auto_reset = bool(cfg.get("auto_reset", True))
         self.ignore_terminations = bool(cfg.get("ignore_terminations", False))
         self.group_size = int(cfg.get("group_size", 1))
+        import torch
+
         if num_envs % self.group_size:
             raise InputError(
                 f"{num_envs} episodes are no multiple of {self.group_size}: change total_num_envs "
@@ -110,6 +114,8 @@ class RLinfEnv:
         env_idx: Sequence[int] | None = None,
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Begin all episodes, or some, in drawn scenes; fixed scenes stay those of the first."""
+        import torch
+
         if not (self.is_start or self._fixed):
             self.update_reset_state_ids()
         self.is_start = False
@@ -134,6 +140,8 @@ class RLinfEnv:
 
         Reward, termination and truncation are those of the clip, at its last row.
         """
+        import torch
+
         rows = np.clip(np.asarray(actions, float), *self.envs.actions.bounds)
         seen, reward, _, _, info = self.envs.chunk_step(rows)
         self.elapsed_steps += rows.shape[1]
@@ -159,6 +167,8 @@ class RLinfEnv:
 
     def _record(self, reward: np.ndarray, success: torch.Tensor) -> dict[str, Any]:
         """Return the metrics of the episodes so far."""
+        import torch
+
         if not self.record_metrics:
             return {}
         self.returns += torch.as_tensor(reward, dtype=torch.float32)
@@ -173,6 +183,8 @@ class RLinfEnv:
         return {"episode": episode}
 
     def _observation(self, seen: dict[str, Any]) -> dict[str, Any]:
+        import torch
+
         return {
             "main_images": torch.as_tensor(seen["frames"][:, -1]),
             "wrist_images": None,
@@ -194,8 +206,8 @@ def _at_the_end(zero: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
 
 def register() -> None:
     """Give RLinf this class for configs with `simulator: egosim_jax`."""
-    import rlinf.envs
-    from rlinf.workers.env import env_worker
+    import rlinf.envs  # pyright: ignore[reportMissingImports]
+    from rlinf.workers.env import env_worker  # pyright: ignore[reportMissingImports]
 
     of_rlinf = rlinf.envs.get_env_cls
 
