@@ -49,8 +49,6 @@ MAX_PUSHES = 8
 """Maximum number of pushes of one object in one contact: two fingers may squeeze it."""
 LEAVE_M = (0.003, 0.010)
 """Distances of flesh and of the pinch point at which a hand has left an object, in meters."""
-CLOSES_SOON = 3
-"""Frames before a grip in which the hand does not push the object that it closes on."""
 CLOSES_M = 0.0001
 """Change of the opening of a hand that closes, in meters a frame."""
 FITS_M = 0.012
@@ -122,7 +120,10 @@ def _appear(walk: Walk, hand: int, joints_m: Float[np.ndarray, "j 3"]) -> None:
 
 
 def _may_push(walk: Walk, hand: int, number: int, length_m: float) -> bool:
-    """Return True if a hand is near an object that it neither holds nor is about to hold."""
+    """Return True if a hand is near an object that it neither holds nor will hold where it is.
+
+    Fingers that close on an object where it is now have not pushed it away before.
+    """
     if number in walk.furniture or number in walk.in_hands:
         return False
     track, solid, pose = walk.tracks[hand], walk.solids[number], walk.poses[number]
@@ -130,13 +131,10 @@ def _may_push(walk: Walk, hand: int, number: int, length_m: float) -> bool:
     gaps = np.linalg.norm(track.joints_m[walk.frame] - center, axis=1)
     if gaps.min() > solid.radius_m + length_m + LEAVE_M[1]:
         return False
-    soon = range(walk.frame, walk.frame + CLOSES_SOON + 1)
-    if walk.given.get(hand) == number and walk.holds[hand][0].begin in soon:
+    holds = [hold for hold in walk.holds[hand] if hold.begin >= walk.frame]
+    if walk.given.get(hand) == number and walk.holds[hand][0] in holds:
         return False
-    return not any(
-        hold.begin in soon and hold.closes and contact_of(solid, pose, track, hold)
-        for hold in walk.holds[hand]
-    )
+    return not any(hold.closes and contact_of(solid, pose, track, hold) for hold in holds)
 
 
 def _push_one(
