@@ -214,8 +214,8 @@ def contact_of(solid: Solid, pose: Pose, track: HandTrack, hold: Hold) -> Contac
         dented = max(depths) > min(DENT_M, UNEVEN_M - max(gaps)) + slack
         pad = PAD_M + min(max(-float(middle), 0.0), DEEP_M) / 2
         gap = float(np.mean(gaps))
-        beside = gap > PAD_M + slack or middle > INSIDE_M + slack / 2
-        if max(gaps) <= pad + slack and not (beside or dented):
+        outside = gap > PAD_M + slack or middle > INSIDE_M + slack / 2
+        if max(gaps) <= pad + slack and not (outside or dented):
             return Contact(pinch_m=point, depth_m=-float(middle), gap_m=gap)
     return None
 

@@ -98,7 +98,7 @@ class Story:
     degrees: float
     """Turn of the head, positive to the left."""
     caption: str
-    """What the hand does."""
+    """Action of the hand, in words."""
 
     def record(self, case: str, method: str, videos: Sequence[np.ndarray], fps: int) -> Record:
         """Return the record of a video of each clip, for WRBench."""

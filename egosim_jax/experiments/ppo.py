@@ -1,7 +1,7 @@
 """PPO of a linear policy by public libraries, each through its adapter of our environment.
 
-Both start at given weights, with normally distributed actions around them, and learn a value of
-their own. An episode is one step, so there is nothing to discount.
+Both start at given weights, with normally distributed actions around them, and learn a
+separate value. An episode is one step, so there is nothing to discount.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from jaxtyping import Float
 from egosim_jax.runtime.progress import track
 
 Weights = Float[np.ndarray, "o1 a"]
-"""Linear policy: the numbers of an action, from what is seen and a 1."""
+"""Linear policy: the numbers of an action, from an observation and a 1."""
 Library = Literal["stable_baselines3", "torchrl"]
 SPREAD = 0.13
 """Standard deviation of the first actions, of numbers from -1 to 1."""

@@ -28,8 +28,9 @@ from egosim_jax.types import InputError, VideoSpec
 from egosim_jax.worlds.tabletop import World, start_of_sequence
 
 PLACE_M, CLOSURES, TURN = 0.05, (0.0, 0.75), 0.3
-"""Faults of the demonstrations: standard deviation of the place (meters), range of the closure,
-standard deviation of the turn, as numbers of an action."""
+"""Faults of the demonstrations, as numbers of an action.
+
+Standard deviation of the place in meters, range of the closure, standard deviation of the turn."""
 RIDGE = 0.05
 """Weight decay of the fit to the demonstrations."""
 WORLDS = {"generated": ("generated world %", "{:.0f}"), "true": ("true world %", "{:.0f}")}

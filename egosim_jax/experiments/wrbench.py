@@ -108,5 +108,5 @@ class Record:
 
 
 def write_manifest(folder: Path, records: Sequence[Mapping[str, Any]]) -> None:
-    """Write videos.json, the last file: it names only what is there."""
+    """Write videos.json, the last file: it names only existing files."""
     write_json(folder / "videos.json", list(records))

@@ -1,8 +1,8 @@
-"""Splatting, fusing and loading on a CPU, beside Open3D and torch.
+"""Splatting, fusing and loading on a CPU, versus Open3D and torch.
 
     python -m tests.benchmarks.bench_cpu [--rounds 9]
 
-Three pairs of programs; those of a pair take turns, so that a busy machine slows both:
+Three pairs of programs; the two of a pair take turns, so that a busy machine slows both:
 
     splat    a million points at 832x480: ours in JAX, and Open3D's `project_to_rgbd_image`
     fuse     17 frames of 832x480 with voxels of 3 mm: ours, and plain Open3D
@@ -85,7 +85,7 @@ def splat() -> tuple[Callable[[], object], Callable[[], object]]:
 
 
 def fuse() -> tuple[Callable[[], object], Callable[[], object]]:
-    """Fuse what stands still in a clip; plain Open3D chooses its blocks itself."""
+    """Fuse the resting surfaces of a clip; plain Open3D chooses its blocks itself."""
     clip = next(make_sequence(0, spec=SPEC))
     still = (clip.ids > 0) & (clip.ids < FIRST_HAND) & (clip.ids != clip.body_ids[clip.target])
     depth_m, fusion = np.where(still, clip.depth_m, 0).astype(np.float32), Fusion()

@@ -232,9 +232,9 @@ def clip(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def run_all(options: argparse.Namespace) -> None:
-    """Run the cases one after the other, each in a process of its own, until the time is over.
+    """Run the cases one after the other, each in a separate process, until the time is over.
 
-    A case that fails does not stop the others. One that would not end in time is left out.
+    A case that fails does not stop the others. One that would not end in time is skipped.
     """
     end = time.monotonic() + options.limit_s
     common = ["--config", options.config, *(["--target", options.target] if options.target else [])]
@@ -242,7 +242,7 @@ def run_all(options: argparse.Namespace) -> None:
         left = end - time.monotonic()
         command = [sys.executable, "-m", "tests.benchmarks.bench_gpu", *words.split(), *common]
         if left < seconds:
-            _note(options.out, {"left out": words, "needs_s": seconds, "left_s": round(left)})
+            _note(options.out, {"skipped": words, "needs_s": seconds, "left_s": round(left)})
             continue
         begun = time.monotonic()
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:

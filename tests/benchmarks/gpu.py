@@ -33,7 +33,7 @@ def compile_all(
 
 
 def half(params: Any) -> Any:
-    """The same shapes, those of float32 in bfloat16."""
+    """The same shapes, float32 as bfloat16."""
     dtype = lambda leaf: jnp.bfloat16 if leaf.dtype == jnp.float32 else leaf.dtype  # noqa: E731
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, dtype(leaf)), params)
 

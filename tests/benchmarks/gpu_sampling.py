@@ -30,8 +30,8 @@ THRESHOLD, SHARE, SCALE = 0.05, 0.5, 5.0
 def sample(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Denoise a clip with guidance: with every pass, with a cache, and with half the grid at first.
 
-    The number of passes that a cache leaves out depends on the weights, which are random here: read
-    the seconds beside the passes that were made.
+    The number of passes that a cache skips depends on the weights, which are random here: read
+    the seconds next to the passes that were made.
     """
     model = replace(configs.get(options.config), steps=options.steps or 6)
     full = replace(model, guidance=Guidance(scale=SCALE), cache=None, progressive=None)
@@ -76,7 +76,7 @@ def sample(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def _predicted(config: ModelConfig, options: argparse.Namespace) -> dict[str, Any]:
-    """Return the memory and the roofline of denoising, if no pass is left out."""
+    """Return the memory and the roofline of denoising, if no pass is skipped."""
     target = find(options.target)
     mesh = make_mesh(MeshConfig(), target.devices)
     programs = compile_generation(config, target, mesh, options.clips)

@@ -88,7 +88,7 @@ def check_reward(reward: RewardFn, start: Start) -> None:
 def reward_of(reward: Any) -> RewardFn:
     """Return a reward function, which a text names: `lift --height-m 0.1`, MODULE:NAME.
 
-    Raises `InputError` for an unknown name, and for what is no function of the outcome.
+    Raises `InputError` for an unknown name, and for a value that is no function of the outcome.
     """
     given = reward
     if isinstance(reward, str):

@@ -51,7 +51,7 @@ class Lift:
         return self.see(running.start.state)
 
     def see(self, state: SceneState) -> Float[np.ndarray, " 6"]:
-        """Return what is seen of the first state of an episode."""
+        """Return the observation of the first state of an episode."""
         center_m, size_m = _shape(state, self.target(state))
         return np.concatenate([(center_m - MIDDLE_M) / REACH_M, size_m / MAX_SIZE_M])
 

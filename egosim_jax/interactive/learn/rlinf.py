@@ -9,7 +9,7 @@ environment config with `simulator: egosim_jax` is of this class:
     reward: my_package:judge   # MODULE:NAME of a reward, with its options
     first_scene: 1000
     scenes: 200
-    max_episode_steps: 64      # rows, of which `num_action_chunks` are one clip
+    max_episode_steps: 64      # rows; a clip has `num_action_chunks`
 
 Actions are rows (`action_spec.py`), cut off at their bounds. RLinf itself is not imported, but for
 `register`.
@@ -113,7 +113,7 @@ class RLinfEnv:
         options: Mapping[str, Any] | None = None,
         env_idx: Sequence[int] | None = None,
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin all episodes, or some, in drawn scenes; fixed scenes stay those of the first."""
+        """Begin all episodes, or some, in drawn scenes; fixed scenes stay."""
         import torch
 
         if not (self.is_start or self._fixed):
@@ -138,7 +138,7 @@ class RLinfEnv:
     ]:
         """Simulate the rows of all episodes, of shape (episodes, rows, numbers), as one batch.
 
-        Reward, termination and truncation are those of the clip, at its last row.
+        Reward, termination and truncation are of the clip, at its last row.
         """
         import torch
 

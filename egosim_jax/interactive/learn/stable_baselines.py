@@ -86,7 +86,7 @@ class StableBaselinesEnv(VecEnv):
         return [getattr(self.envs, method_name)(*args, **options)] * len(self._indices(indices))
 
     def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
-        """Return False for each episode: they have no wrappers of their own."""
+        """Return False for each episode: they have no wrappers."""
         return [False] * len(self._indices(indices))
 
     def _indices(self, indices: VecEnvIndices) -> Sequence[int]:

@@ -11,7 +11,7 @@ from egosim_jax.experiments.ppo import LIBRARIES
 
 
 class Echo(VectorEnv):
-    """An action earns a reward where it is near what is seen; each episode is one step."""
+    """An action earns a reward where it is near its observation; each episode is one step."""
 
     metadata = {"autoreset_mode": AutoresetMode.DISABLED, "render_modes": []}  # noqa: RUF012
     autoreset_mode = AutoresetMode.DISABLED

@@ -133,7 +133,7 @@ def test_the_simulator_predicts_what_it_shows_and_streams_groups():
 
 
 def test_a_hand_at_one_side_of_the_image_is_drawn():
-    """Its window has no principal point of its own."""
+    """The principal point is outside its window."""
     acted = action()
     aside = replace(acted, joints_m=acted.joints_m * 0.5 + [0.25, 0.1, 0.6])
     drawn = is_drawn(make(view(depth_m=2.0), aside))

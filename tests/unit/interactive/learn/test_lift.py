@@ -29,7 +29,7 @@ def action(start, offset_m=(0, 0.02, 0), closure=0.4):
 
 
 def rise(start, numbers):
-    """How high the target rises in the true world."""
+    """Return the rise of the target in the true world."""
     rows = Lift().path(numbers, SPEC.rest, SPEC, frames=VIDEO.frames)
     moved = make_chunk(SPEC, rows, start=start, video=VIDEO).action
     scene = start_of_sequence(SEED, spec=VIDEO, kind="human")[0]

@@ -77,7 +77,7 @@ def test_success_terminates_unless_terminations_are_ignored(make):
         *_, ended, _, (infos,) = env.chunk_step(rows(env))
         assert ended[:, -1].tolist() == [not ignored] * 2
         assert infos["episode"]["success_once"].all()
-        env.chunk_step(rows(env))  # without auto_reset it goes on
+        env.chunk_step(rows(env))  # without auto_reset it continues
 
 
 def test_a_group_shares_a_scene_and_rows_beyond_the_bounds_are_cut_off(make):
