@@ -43,6 +43,8 @@ DENT_M = 0.018
 """Maximum depth of a fingertip in a hull, in meters; a fist that enters an object grips nothing."""
 UNEVEN_M = 0.018
 """Maximum difference between the distances of both fingertips from a hull, in meters."""
+DEEPEST = 0.9
+"""Depth of the shallower fingertip, relative to the pinch point, from which both are inside."""
 INSIDE_M = 0.001
 """Maximum distance of the pinch point from a hull, in meters."""
 SAME_WAY = 0.7
@@ -196,14 +198,18 @@ def _last_closed(track: HandTrack, steady: int, width_m: float) -> int:
     return steady + int(ended[0]) if len(ended) else len(wide) - 1
 
 
-def contact_of(solid: Solid, pose: Pose, track: HandTrack, hold: Hold) -> Contact | None:
+def contact_of(
+    solid: Solid, pose: Pose, track: HandTrack, hold: Hold, *, slack_m: float = 0.0
+) -> Contact | None:
     """Return the contact of the fingers around a solid in a hold; None if they do not grip it.
+
+    `slack_m` is added to the distances that are allowed.
 
     A hand may close and begin to carry between two frames. So the pinch point of the frame before
     the hold counts too, first if the hand's motions before and after have one direction.
     """
     tips = track.grasping_m(hold.begin, hold.steady)
-    pinch, slack = tips.mean(axis=0), SIGMAS * track.sigma_m
+    pinch, slack = tips.mean(axis=0), slack_m + SIGMAS * track.sigma_m
     for point in _pinch_points(track, hold, pinch):
         around = tips - pinch + point
         *gaps, middle = solid.distance(np.concatenate([around, point[None]]), pose)
@@ -214,6 +220,8 @@ def contact_of(solid: Solid, pose: Pose, track: HandTrack, hold: Hold) -> Contac
         dented = max(depths) > min(DENT_M, UNEVEN_M - max(gaps)) + slack
         pad = PAD_M + min(max(-float(middle), 0.0), DEEP_M) / 2
         gap = float(np.mean(gaps))
+        # Of fingers at two sides, one is nearer to the surface than the point between them.
+        dented |= max(gaps) < DEEPEST * min(float(middle), 0.0) - slack
         outside = gap > PAD_M + slack or middle > INSIDE_M + slack / 2
         if max(gaps) <= pad + slack and not (outside or dented):
             return Contact(pinch_m=point, depth_m=-float(middle), gap_m=gap)

@@ -49,6 +49,8 @@ MAX_PUSHES = 8
 """Maximum number of pushes of one object in one contact: two fingers may squeeze it."""
 LEAVE_M = (0.003, 0.010)
 """Distances of flesh and of the pinch point at which a hand has left an object, in meters."""
+MISS_M = 0.01
+"""Distance by which fingers that close on an object may miss it, in meters."""
 CLOSES_M = 0.0001
 """Change of the opening of a hand that closes, in meters a frame."""
 FITS_M = 0.012
@@ -122,7 +124,8 @@ def _appear(walk: Walk, hand: int, joints_m: Float[np.ndarray, "j 3"]) -> None:
 def _may_push(walk: Walk, hand: int, number: int, length_m: float) -> bool:
     """Return True if a hand is near an object that it neither holds nor will hold where it is.
 
-    Fingers that close on an object where it is now have not pushed it away before.
+    Fingers that close on an object where it is now, or miss it by a little, have not pushed it away
+    before.
     """
     if number in walk.furniture or number in walk.in_hands:
         return False
@@ -134,7 +137,9 @@ def _may_push(walk: Walk, hand: int, number: int, length_m: float) -> bool:
     holds = [hold for hold in walk.holds[hand] if hold.begin >= walk.frame]
     if walk.given.get(hand) == number and walk.holds[hand][0] in holds:
         return False
-    return not any(hold.closes and contact_of(solid, pose, track, hold) for hold in holds)
+    return not any(
+        hold.closes and contact_of(solid, pose, track, hold, slack_m=MISS_M) for hold in holds
+    )
 
 
 def _push_one(
