@@ -17,10 +17,11 @@ from jaxtyping import Bool, UInt8
 
 from egosim_jax.data.sheet import SheetClip, draw_sheet
 from egosim_jax.evaluation.metrics import region
+from egosim_jax.evaluation.metrics.rates import rate
 from egosim_jax.evaluation.metrics.state_update import ON_SURFACE_M, distance_to_mesh
 from egosim_jax.experiments.config import LookAway
 from egosim_jax.experiments.continuous import METHODS, NOT_UPDATED, folder_name
-from egosim_jax.experiments.report import differences, share, show, summaries, write_report
+from egosim_jax.experiments.report import differences, show, summaries, write_report
 from egosim_jax.experiments.scenes import carrying
 from egosim_jax.experiments.wrbench import Record, write_manifest
 from egosim_jax.generation.generator import Generator
@@ -67,7 +68,7 @@ CASES_KEY = "seen, unseen"
 DEFINITIONS = {
     "kept": f"100 if the object is within {NEAR_PERCENT:g} % of the image's width of its true "
     f"place in the last {FRAMES_BACK} frames, after looking back, else 0; in the table, the share "
-    "of scenes with Wilson's 95 % interval",
+    "of scenes with the 95 % interval of Clopper and Pearson",
     "object_error": "distance between the object's centroid, segmented by color among the colors "
     "of all bodies, and the centroid of its ground-truth ids, in percent of the width, median over "
     "the same frames",
@@ -175,7 +176,7 @@ def run(settings: LookAway) -> None:
     write_manifest(out / "wrbench", records)
     table, gaps = summaries(scores, MEASURES), {}
     for name, values in scores.items():
-        table[name]["kept"] = share([bool(value["kept"]) for value in values])
+        table[name]["kept"] = rate(sum(value["kept"] > 0 for value in values), len(values))
     for case in CASES:
         by_method = {f"{case}: {method}": scores[f"{case}: {method}"] for method in METHODS}
         gaps |= differences(by_method, f"{case}: {NOT_UPDATED}", MEASURES)

@@ -74,16 +74,6 @@ def _means(scores: Scores, measures: Iterable[str]) -> dict[str, float]:
     return {name: summary["mean"] for name, summary in summarize(scores, measures).items()}
 
 
-def share(values: Sequence[bool]) -> dict[str, float]:
-    """Return a share in percent with Wilson's 95 % interval, which is right for few values."""
-    from scipy.stats import binomtest
-
-    hits = sum(values)
-    interval = binomtest(hits, len(values)).proportion_ci(method="wilson")
-    low, high = 100 * float(interval.low), 100 * float(interval.high)
-    return {"mean": 100 * hits / len(values), "low": low, "high": high}
-
-
 def show(title: str | None, rows: Mapping[str, Summary], measures: Measures) -> None:
     """Print a table of methods."""
     print_table("", rows, measures, title=title)

@@ -13,10 +13,11 @@ from itertools import count, islice
 
 import numpy as np
 
-from egosim_jax.evaluation.metrics.report import paired_difference, print_table
+from egosim_jax.evaluation.metrics.rates import difference, rate
+from egosim_jax.evaluation.metrics.report import print_table
 from egosim_jax.experiments.config import TrainPolicy
 from egosim_jax.experiments.ppo import LIBRARIES, Weights
-from egosim_jax.experiments.report import cached, share, write_report
+from egosim_jax.experiments.report import cached, write_report
 from egosim_jax.interactive.env import ActionSpec, load_backend, make_vec
 from egosim_jax.interactive.env.backends import Backend, tabletop_start
 from egosim_jax.interactive.env.chunks import make_chunk
@@ -35,9 +36,9 @@ RIDGE = 0.05
 """Weight decay of the fit to the demonstrations."""
 WORLDS = {"generated": ("generated world %", "{:.0f}"), "true": ("true world %", "{:.0f}")}
 DEFINITIONS = {
-    "success": "share of scenes in which the object rises by 5 cm, in percent; Wilson's 95 % "
-    "interval",
-    "difference": "after minus before, on the same scenes; Student's 95 % interval",
+    "success": "share of scenes in which the object rises by 5 cm, in percent; 95 % interval of "
+    "Clopper and Pearson",
+    "difference": "after minus before, on the same scenes, with its 95 % interval",
     "generated": "by the state that perception updates by the generated clip",
     "true": "by the pose of the body in the tabletop world, which executes the same rows",
 }
@@ -156,18 +157,11 @@ def _report(
     tests: Sequence[int],
 ) -> None:
     table = {
-        name: {world: share(values) for world, values in by_world.items()}
+        name: {world: rate(sum(values), len(values)) for world, values in by_world.items()}
         for name, by_world in outcomes.items()
     }
     table["difference"] = {
-        world: {
-            key: 100 * value
-            for key, value in paired_difference(
-                np.asarray(outcomes["after"][world], float).tolist(),
-                np.asarray(outcomes["before"][world], float).tolist(),
-            ).items()
-        }
-        for world in WORLDS
+        world: difference(outcomes["after"][world], outcomes["before"][world]) for world in WORLDS
     }
     write_report(
         settings.out,

@@ -184,12 +184,11 @@ def _light(hands: MovingMesh, cameras: Cameras, depth_m: DepthMaps) -> DepthMaps
 def _window(hands: MovingMesh, cameras: Cameras) -> tuple[slice, slice]:
     """Return the rows and columns that hands and their shadow can be in.
 
-    They include the principal point, which cameras must have in their image.
+    They include the principal point: the image of `Cameras` has it.
     """
     sizes = cameras.height, cameras.width
     full = slice(0, sizes[0]), slice(0, sizes[1])
-    low: list[np.ndarray] = []
-    high: list[np.ndarray] = []
+    low, high = [], []
     for pose, vertices in zip(cameras.world_from_camera, hands.vertices_m, strict=True):
         local = transform(invert(pose), vertices[np.isfinite(vertices).all(axis=1)])
         if not len(local):
@@ -202,11 +201,9 @@ def _window(hands: MovingMesh, cameras: Cameras) -> tuple[slice, slice]:
         high.append(pixels.max(axis=0) + margin)
     if not low:
         return slice(0, 0), slice(0, 0)
-    center = cameras.intrinsics_px[1::-1, 2]
-    low, high = [*low, center], [*high, center]
     first = np.clip(np.floor(np.min(low, axis=0)), 0, sizes).astype(int)
     last = np.clip(np.ceil(np.max(high, axis=0)) + 1, 0, sizes).astype(int)
-    if (first < last).all():  # the principal point of `Cameras` is inside the image
+    if (first < last).all():
         middle = np.clip(cameras.intrinsics_px[[1, 0], 2], 0, np.array(sizes) - 1)
         first = np.minimum(first, np.floor(middle).astype(int))
         last = np.maximum(last, np.ceil(middle).astype(int) + 1)
