@@ -50,7 +50,7 @@ MAX_PUSHES = 8
 LEAVE_M = (0.003, 0.010)
 """Distances of flesh and of the pinch point at which a hand has left an object, in meters."""
 MISS_M = 0.01
-"""Distance by which fingers that close on an object may miss it, in meters."""
+"""Distance of a near miss of fingers that close on an object, in meters."""
 CLOSES_M = 0.0001
 """Change of the opening of a hand that closes, in meters a frame."""
 FITS_M = 0.012
