@@ -18,7 +18,10 @@ from egosim_jax.runtime.terminal import print_line, printable
 from egosim_jax.types import InputError, check_counts
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from egosim_jax.interactive.env.backends import Backend
+    from egosim_jax.simulation.rig import MountedCamera
     from egosim_jax.trials.evaluation import Results
     from egosim_jax.trials.policies import Policy
 
@@ -39,7 +42,7 @@ class EvaluatePolicy:
     """
 
     help_groups: ClassVar[HelpGroups] = {
-        "actions": ("actions", "hands", "camera"),
+        "actions": ("actions", "hands", "camera", "cameras"),
         "policy servers": ("send", "wait"),
     }
     policies: tuple[str, ...]
@@ -70,10 +73,13 @@ class EvaluatePolicy:
     """Hands, in the order of a row."""
     camera: bool = False
     """Rows also have the pose of the camera."""
+    cameras: Path | None = None
+    """Further cameras that policies see: JSON, a list of the fields of MountedCamera."""
     send: tuple[str, ...] = SEND
     """Parts of the observation for policy servers, as KEY=PART.
 
-    PART is image (the last frame), frames, row, keypoints, prompt, chunk or seed."""
+    PART is image (the last frame), frames, row, keypoints, prompt, chunk or seed; of a further
+    camera, NAME.image or NAME.frames."""
     wait: float = 0.0
     """Time in seconds for which a policy server that has not started is tried again."""
     dataset: bool = True
@@ -94,18 +100,19 @@ class EvaluatePolicy:
             from egosim_jax.trials import evaluation
             from egosim_jax.trials.starts import read_starts
 
-            policies = self._policies()
+            cameras = self._cameras()
+            policies = self._policies(cameras)
             for policy in policies:
                 policy.open()
         chosen = [tasks.parse(text) for text in self.tasks]
         share_with_jax()
-        backend = self._world()
+        backend = self._world(1 + len(cameras))
         read_lerobot = partial(episode_from_lerobot, clips=1)
         starts = read_starts(self.starts, backend.video, read_lerobot)
-        trials = evaluation.plan(backend, policies, chosen, starts, seed=self.seed)
+        trials = evaluation.plan(backend, policies, chosen, starts, seed=self.seed, cameras=cameras)
         for note in sorted({backend.note(trial.start) or "" for trial in trials} - {""}):
             print(printable(note), file=sys.stderr, flush=True)
-        open_folder(self.out, self._config(backend))
+        open_folder(self.out, self._config(backend, cameras))
         results = evaluation.run_all(
             trials, backend, self.out, clips=self.clips_per_trial, batch=self.batch
         )
@@ -127,15 +134,30 @@ class EvaluatePolicy:
                 "'egosim-jax[video]', or give --no-dataset. (--dataset)"
             )
 
-    def _policies(self) -> list[Policy]:
+    def _cameras(self) -> tuple[MountedCamera, ...]:
+        from egosim_jax.io.bounded import quote_path, read_json
+        from egosim_jax.simulation.rig import MountedCamera, check_cameras
+
+        if self.cameras is None:
+            return ()
+        listed = read_json(self.cameras)
+        if not isinstance(listed, list):
+            raise InputError(
+                f"{quote_path(self.cameras)} is no list: it must be a JSON list of cameras, each "
+                "a map with name, mount and pose. (--cameras)"
+            )
+        return check_cameras([MountedCamera.from_json(fields) for fields in listed], self.hands)
+
+    def _policies(self, cameras: Sequence[MountedCamera]) -> list[Policy]:
         from egosim_jax.interactive.env.action_spec import ActionSpec
         from egosim_jax.trials import policies
 
         spec = ActionSpec(layout=self.actions, sides=self.hands, camera=self.camera)
-        serving = policies.Serving(sent=policies.parse_sent(self.send), wait_s=self.wait)
+        serving = policies.Serving(sent=policies.parse_sent(self.send, cameras), wait_s=self.wait)
         return policies.parse_all(self.policies, spec, serving)
 
-    def _world(self) -> Backend:
+    def _world(self, clips: int) -> Backend:
+        """Return the world, for trials that have a number of clips at once each."""
         from egosim_jax.interactive.env import load_backend
         from egosim_jax.simulation.episode import DESCRIPTION, Episode
 
@@ -143,15 +165,18 @@ class EvaluatePolicy:
         found = (p for p in paths if p.suffix == ".zip" or (p / DESCRIPTION).exists())
         first = next(found, None)
         episode = None if first is None else Episode.load(first)
-        return load_backend(self.world, batch=self.batch, episode=episode, **vars(self.clips))
+        return load_backend(
+            self.world, batch=self.batch * clips, episode=episode, **vars(self.clips)
+        )
 
-    def _config(self, backend: Backend) -> dict[str, object]:
+    def _config(self, backend: Backend, cameras: Sequence[MountedCamera]) -> dict[str, object]:
         """Return what all trials of a folder share."""
         return {
             "world": backend.identity(),
             "clips_per_trial": self.clips_per_trial,
             "seed": self.seed,
             "send": list(self.send),
+            **({"cameras": [camera.to_json() for camera in cameras]} if cameras else {}),
         }
 
     def _write(self, results: Results, reference: str, backend: Backend) -> None:

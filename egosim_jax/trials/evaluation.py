@@ -16,11 +16,13 @@ from threading import Event
 from typing import Any
 
 from egosim_jax.interactive.env.backends import Backend
+from egosim_jax.interactive.env.observing import Observer
 from egosim_jax.interactive.env.tasks import Goal, Task, describe
 from egosim_jax.interactive.env.true_world import TrueWorld
 from egosim_jax.io.bounded import quote, quote_text
 from egosim_jax.runtime.phases import hide_phases, phase
 from egosim_jax.runtime.progress import track
+from egosim_jax.simulation.rig import MountedCamera
 from egosim_jax.simulation.start import Start, check_size
 from egosim_jax.trials.policies import Policy, RowsError, ScriptedPolicy
 from egosim_jax.trials.starts import TrialStart, carried
@@ -48,8 +50,11 @@ def plan(
     starts: Sequence[TrialStart],
     *,
     seed: int,
+    cameras: tuple[MountedCamera, ...] = (),
 ) -> list[Trial]:
     """Return all trials: each policy with each task, from each start that has its objects.
+
+    Policies also see the clips of further `cameras`.
 
     Raises `InputError` if the world cannot begin from a start, and for a task that no start has.
     """
@@ -61,7 +66,9 @@ def plan(
                 key = repr(policy.actions)
                 if key not in begun:
                     begun[key] = _begin(backend, place, policy, seed)
-                trials += _trials(backend, policy, tasks, place, begun[key])
+                    _check_cameras(backend, policy, begun[key], cameras)
+                made_of = _trials(backend, policy, tasks, place, begun[key])
+                trials += [replace(trial, cameras=cameras) for trial in made_of]
     made = {trial.group for trial in trials}
     for task in tasks:
         if task.text not in made:
@@ -85,6 +92,14 @@ def _begin(backend: Backend, place: TrialStart, policy: Policy, seed: int) -> St
     if isinstance(backend, TrueWorld):  # no noise; its seed is the scene's
         return start
     return replace(start, seed=start.seed + NOISE * seed)
+
+
+def _check_cameras(
+    backend: Backend, policy: Policy, start: Start, cameras: tuple[MountedCamera, ...]
+) -> None:
+    """Raise `InputError` if a camera is on a hand that a policy has not, or sees nothing."""
+    observer = Observer(backend=backend, actions=policy.actions, cameras=cameras)
+    observer.first_frames(start)
 
 
 def _trials(

@@ -27,6 +27,7 @@ from egosim_jax.interactive.env.action_spec import ActionSpec, to_numbers
 from egosim_jax.interactive.env.chunks import straight_path
 from egosim_jax.io.bounded import quote, quote_text
 from egosim_jax.runtime.registry import Registry
+from egosim_jax.simulation.rig import MountedCamera
 from egosim_jax.types import InputError
 from egosim_jax.worlds.tabletop import Script
 from egosim_jax.worlds.tabletop import policies as scripted
@@ -264,14 +265,16 @@ def parse_all(texts: Sequence[str], actions: ActionSpec, serving: Serving) -> li
     return policies
 
 
-def parse_sent(texts: Sequence[str]) -> dict[str, str]:
+def parse_sent(texts: Sequence[str], cameras: Sequence[MountedCamera] = ()) -> dict[str, str]:
     """Return the name of the part of an observation that each key of a policy server has."""
+    further = [f"{camera.name}.{part}" for camera in cameras for part in ("image", "frames")]
+    parts = (*OBSERVED, *further)
     sent = {}
     for text in texts:
         key, separator, name = text.rpartition("=")
-        if not (separator and key and name in OBSERVED):
+        if not (separator and key and name in parts):
             raise InputError(
-                f"{quote(text)} sends nothing: give KEY=PART, with one of {', '.join(OBSERVED)} as "
+                f"{quote(text)} sends nothing: give KEY=PART, with one of {', '.join(parts)} as "
                 "PART, such as observation/image=image. (--send)"
             )
         sent[key] = name

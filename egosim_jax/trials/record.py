@@ -18,6 +18,7 @@ import numpy as np
 
 from egosim_jax.data.lerobot_writer import ClipRecord, EpisodeRecord, write_lerobot
 from egosim_jax.interactive.env.backends import Backend
+from egosim_jax.interactive.server.dataset_export import clip_record
 from egosim_jax.interactive.server.session import Session
 from egosim_jax.io.digest import fingerprint
 from egosim_jax.trials.evaluation import by_policy
@@ -77,14 +78,15 @@ def _clips(session: Session, trial: Mapping[str, Any]) -> Iterator[ClipRecord]:
     """Yield the clips of a trial; the caption is the instruction, as LeRobot's task."""
     count = trial["clips"]
     for number in range(1, count + 1):
-        rows, action = session.rows(number), session.action(number)
-        reward, ended = np.zeros(len(rows), np.float32), np.zeros(len(rows), bool)
+        record = clip_record(session, number)
+        count_rows = len(record.rows)
+        reward, ended = np.zeros(count_rows, np.float32), np.zeros(count_rows, bool)
         reward[-2] = trial["rewards"][number - 1]  # of the action that leads to the last frame
         if number == count:
             ended[-2:] = True
-        yield ClipRecord(
-            frames=session.load_result(number).frames,
-            rows=rows,
-            action=replace(action, prompt=trial["instruction"]),
-            others={REWARD: reward, SUCCESS: ended & trial["success"], DONE: ended},
+        judged = {REWARD: reward, SUCCESS: ended & trial["success"], DONE: ended}
+        yield replace(
+            record,
+            action=replace(record.action, prompt=trial["instruction"]),
+            others={**record.others, **judged},
         )

@@ -32,6 +32,7 @@ from egosim_jax.interactive.server.session import DAMAGE, SETTINGS, Result, Sess
 from egosim_jax.io.bounded import quote_path, read_json
 from egosim_jax.io.run import write_json
 from egosim_jax.io.writing import write_frames
+from egosim_jax.simulation.rig import MountedCamera
 from egosim_jax.simulation.simulator import Step
 from egosim_jax.simulation.start import Start
 from egosim_jax.trials.agreement import agreement
@@ -66,6 +67,8 @@ class Trial:
     """Script of the scene, for scripted policies."""
     scene_seed: int | None
     """Seed of the scene if it is of the tabletop world and a model makes the clips."""
+    cameras: tuple[MountedCamera, ...] = ()
+    """Further cameras that the policy sees."""
 
     @property
     def id(self) -> str:
@@ -94,7 +97,7 @@ class Trial:
                 return Session(folder, backend)
             except DAMAGE:
                 shutil.rmtree(folder)
-        return Session.create(folder, backend, self.policy.actions, self.start)
+        return Session.create(folder, backend, self.policy.actions, self.start, self.cameras)
 
     def _run(self, session: Session, clips: int, stop: Event) -> dict[str, Any]:
         rewards: list[Reward] = []
@@ -145,13 +148,16 @@ class Trial:
         return self.goal(Outcome(first=self.start.state, step=made))
 
     def _observation(self, session: Session, number: int, last: Result) -> dict[str, Any]:
-        frames, count = last.frames, session.backend.video.frames
-        if len(frames) < count:  # after a reset there is one
-            frames = np.repeat(frames[:1], count, axis=0)
+        seen, count = {"": last.frames}, session.backend.video.frames
+        seen |= {f"{name}.": frames for name, frames in last.others.items()}
+        images: dict[str, Any] = {}
+        for name, frames in seen.items():
+            if len(frames) < count:  # after a reset there is one
+                frames = np.repeat(frames[:1], count, axis=0)
+            images |= {f"{name}frames": frames.copy(), f"{name}image": frames[-1].copy()}
         return {
+            **images,
             "row": last.row.copy(),
-            "frames": frames.copy(),
-            "image": frames[-1].copy(),
             "keypoints": session.actions.joints(last.row[None])[0].copy(),
             "prompt": self.goal.instruction,
             "chunk": number - 1,

@@ -188,18 +188,22 @@ def _has_previews(session: Session) -> bool:
 
 
 def _clips(session: Session, steps: Sequence[int]) -> Iterator[ClipRecord]:
-    for number in steps:
-        result, action = session.load_result(number), session.action(number)
-        rows, observer = session.rows(number), session.observer
-        paths = observer.paths(action.cameras, rows) if observer.cameras else {}
-        vectors = [camera_vectors(name, path) for name, path in paths.items()]
-        yield ClipRecord(
-            frames=result.frames,
-            rows=rows,
-            action=action,
-            images={image_feature(name): frames for name, frames in result.others.items()},
-            others={name: values for of_camera in vectors for name, values in of_camera.items()},
-        )
+    return (clip_record(session, number) for number in steps)
+
+
+def clip_record(session: Session, number: int) -> ClipRecord:
+    """Return the record of a committed step, with the clips of all its cameras."""
+    result, action = session.load_result(number), session.action(number)
+    rows, observer = session.rows(number), session.observer
+    paths = observer.paths(action.cameras, rows) if observer.cameras else {}
+    vectors = [camera_vectors(name, path) for name, path in paths.items()]
+    return ClipRecord(
+        frames=result.frames,
+        rows=rows,
+        action=action,
+        images={image_feature(name): frames for name, frames in result.others.items()},
+        others={name: values for of_camera in vectors for name, values in of_camera.items()},
+    )
 
 
 def _steps(session: Session) -> Iterator[tuple[int, SceneState, View, Any]]:

@@ -6,10 +6,12 @@ import sys
 import textwrap
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import egosim_jax.interactive.env
 from egosim_jax.cli.evaluate_policy import EvaluatePolicy
+from egosim_jax.geometry import look_at
 from egosim_jax.interactive.env.true_world import TrueWorld
 from egosim_jax.runtime.command import CommandExit, ExitCode
 from egosim_jax.types import InputError, VideoSpec
@@ -59,6 +61,30 @@ def test_the_documented_policy_lifts_an_object_and_all_files_are_written(module,
         command(out, seed=1).run()
 
 
+def test_a_policy_sees_further_cameras_and_its_dataset_has_them(module, tmp_path, monkeypatch):
+    import lift
+
+    seen = []
+
+    def looks(observation):
+        seen.append((observation["side.image"], observation["side.frames"], observation["image"]))
+        return observation["row"] if observation["chunk"] == 0 else None
+
+    monkeypatch.setattr(lift, "looks", looks, raising=False)
+    pose = look_at(np.array([0.45, 0.05, 0.42]), np.array([0, 0.28, 0.03]), up=np.eye(3)[2])
+    (tmp_path / "cameras.json").write_text(
+        json.dumps([{"name": "side", "mount": "world", "pose": pose.tolist()}])
+    )
+    options = {"cameras": tmp_path / "cameras.json", "policies": ("lift:looks",)}
+    assert command(tmp_path / "out", **options).run() == ExitCode.DONE
+    image, frames, main = seen[1]
+    assert frames.shape == (VIDEO.frames, VIDEO.height, VIDEO.width, 3)
+    assert (image == frames[-1]).all()
+    assert (image != main).any()
+    info = json.loads((tmp_path / "out" / "lerobot" / "lift-looks" / "meta/info.json").read_text())
+    assert "observation.images.side" in info["features"]
+
+
 def test_a_policy_that_fails_is_listed(module, tmp_path, monkeypatch, capsys):
     import lift
 
@@ -91,6 +117,9 @@ def test_other_policies_count_although_one_fails(module, tmp_path, monkeypatch):
         ({"seed": -1}, "--seed"),
         ({"page_clips": -1}, "--page-clips"),
         ({"wait": -1.0}, "--wait"),
+        ({"send": ("wrist=wrist.image",)}, "--send"),
+        ({"cameras": ROOT / "pyproject.toml"}, "JSON"),
+        ({"cameras": ROOT / "tests" / "system" / "shipped.json"}, "--cameras"),
     ],
 )
 def test_bad_options_are_refused_before_anything_is_written(module, tmp_path, changes, option):
