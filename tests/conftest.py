@@ -17,6 +17,7 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE / "compiled"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ["XDG_CACHE_HOME"] = str(CACHE / "home")
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # the workers use all cores; more threads spin
+os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"  # torchrl imports ray, which then reads it
 
 NEEDS_TORCH = re.compile(r"^(?:import|from) torch\b", re.MULTILINE)
 
