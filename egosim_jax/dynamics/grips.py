@@ -43,8 +43,6 @@ DENT_M = 0.018
 """Maximum depth of a fingertip in a hull, in meters; a fist that enters an object grips nothing."""
 UNEVEN_M = 0.018
 """Maximum difference between the distances of both fingertips from a hull, in meters."""
-DEEPEST = 0.9
-"""Depth of the shallower fingertip, relative to the pinch point, from which both are inside."""
 INSIDE_M = 0.001
 """Maximum distance of the pinch point from a hull, in meters."""
 SAME_WAY = 0.7
@@ -220,8 +218,6 @@ def contact_of(
         dented = max(depths) > min(DENT_M, UNEVEN_M - max(gaps)) + slack
         pad = PAD_M + min(max(-float(middle), 0.0), DEEP_M) / 2
         gap = float(np.mean(gaps))
-        # Of fingers at two sides, one is nearer to the surface than the point between them.
-        dented |= max(gaps) < DEEPEST * min(float(middle), 0.0) - slack
         outside = gap > PAD_M + slack or middle > INSIDE_M + slack / 2
         if max(gaps) <= pad + slack and not (outside or dented):
             return Contact(pinch_m=point, depth_m=-float(middle), gap_m=gap)
