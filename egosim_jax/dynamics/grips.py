@@ -41,7 +41,7 @@ DEEP_M = 0.012
 The visible side of a ball is smaller than the ball."""
 DENT_M = 0.018
 """Maximum depth of a fingertip in a hull, in meters; a fist that enters an object grips nothing."""
-UNEVEN_M = 0.018
+UNEVEN_M = 0.025
 """Maximum difference between the distances of both fingertips from a hull, in meters."""
 INSIDE_M = 0.001
 """Maximum distance of the pinch point from a hull, in meters."""
