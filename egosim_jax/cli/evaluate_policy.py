@@ -162,8 +162,8 @@ class EvaluatePolicy:
         from egosim_jax.simulation.episode import DESCRIPTION, Episode
 
         paths = [Path(text) for text in self.starts]
-        found = (p for p in paths if p.suffix == ".zip" or (p / DESCRIPTION).exists())
-        first = next(found, None)
+        episodes = (p for p in paths if p.suffix == ".zip" or (p / DESCRIPTION).exists())
+        first = next(episodes, None)
         episode = None if first is None else Episode.load(first)
         return load_backend(
             self.world, batch=self.batch * clips, episode=episode, **vars(self.clips)

@@ -207,8 +207,8 @@ class Actions:
                 "depth_m or as a network, or a state. (--depth, --state)"
             )
         video = configs.get(self.config).video
-        own = load_own(self.robot)
-        replay = open_replay(self.dataset, self.episode, own, column=self.joints)
+        robot = load_own(self.robot)
+        replay = open_replay(self.dataset, self.episode, robot, column=self.joints)
         state, image = self._scene(replay)
         episode = episode_of(replay, video, state, first_frame=image, clips=self.clips)
         return save_episode(episode, self.out, describe=True)

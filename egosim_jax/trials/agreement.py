@@ -95,25 +95,28 @@ def _predicted(states: list[SceneState], actions: list[Action], fps: int) -> Ite
     for before, after, action in zip(states, states[1:], actions, strict=False):
         paths = predict(before, action, fps=fps).paths
         for number in objects_of(before):
-            center = _center(before, number)
             predicted = paths[number].motion[-1] if number in paths else np.eye(4)
-            places = [
-                transform(m[None], center)[0] for m in (predicted, _motion(before, after, number))
-            ]
-            if max(np.linalg.norm(place - center) for place in places) > MOVED_M:
-                yield float(np.linalg.norm(places[0] - places[1]))
+            yield from _apart_m(_center(before, number), predicted, _motion(before, after, number))
 
 
 def _distances_m(
     first: SceneState, states: list[SceneState], true: list[SceneState]
 ) -> Iterator[float]:
     """Yield the distance in meters of each object that a state or the true world has moved."""
-    for state, known in zip(states, true, strict=True):
+    for state, truth in zip(states, true, strict=True):
         for number in objects_of(first):
-            center = _center(first, number)
-            places = [transform(_motion(first, s, number)[None], center)[0] for s in (state, known)]
-            if max(np.linalg.norm(place - center) for place in places) > MOVED_M:
-                yield float(np.linalg.norm(places[0] - places[1]))
+            motions = (_motion(first, after, number) for after in (state, truth))
+            yield from _apart_m(_center(first, number), *motions)
+
+
+def _apart_m(center: Float[np.ndarray, "1 3"], *motions: Pose) -> Iterator[float]:
+    """Yield the distance in meters between the places to which two motions bring an object.
+
+    Nothing if neither moves it.
+    """
+    places = [transform(motion[None], center)[0] for motion in motions]
+    if max(np.linalg.norm(place - center) for place in places) > MOVED_M:
+        yield float(np.linalg.norm(places[0] - places[1]))
 
 
 def _true_states(
@@ -150,6 +153,8 @@ def _center(state: SceneState, number: int) -> Float[np.ndarray, "1 3"]:
 
 def _motion(before: SceneState, after: SceneState, number: int) -> Pose:
     """Return the motion of an object between two states."""
-    poses = (np.asarray(s.world_from_object.get(number, np.eye(4)), float) for s in (before, after))
-    earlier, later = poses
+    earlier, later = (
+        np.asarray(state.world_from_object.get(number, np.eye(4)), float)
+        for state in (before, after)
+    )
     return later @ invert(earlier)

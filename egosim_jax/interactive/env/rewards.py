@@ -90,7 +90,7 @@ def reward_of(reward: Any) -> RewardFn:
 
     Raises `InputError` for an unknown name, and for a value that is no function of the outcome.
     """
-    given = reward
+    named_by = reward
     if isinstance(reward, str):
         name = reward.split(maxsplit=1)[0] if reward.strip() else ""
         named = REWARDS.get(name)
@@ -98,7 +98,7 @@ def reward_of(reward: Any) -> RewardFn:
         reward = REWARDS.parse(reward) if isinstance(named, type) or reward != name else named
     if not callable(reward):
         raise InputError(
-            f"The reward is {quote(given)}: it must be MoveObject, GoalImage, a function of an "
+            f"The reward is {quote(named_by)}: it must be MoveObject, GoalImage, a function of an "
             "Outcome that returns a Reward, or the MODULE:NAME of one. (reward)"
         )
     return cast(RewardFn, reward)

@@ -78,12 +78,12 @@ class WorldVectorEnv(VectorEnv):
         self.num_envs, self.backend, self.actions = num_envs, backend, actions or ActionSpec()
         self._observe, self._max_chunks = tuple(observe), max_chunks
         single = callable(reward) or isinstance(reward, str)
-        given = [reward] * num_envs if single else list(cast(Sequence[RewardFn | str], reward))
-        if len(given) != num_envs:
+        rewards = [reward] * num_envs if single else list(cast(Sequence[RewardFn | str], reward))
+        if len(rewards) != num_envs:
             raise InputError(
-                f"{len(given)} rewards for {num_envs} episodes: give one, or one for each."
+                f"{len(rewards)} rewards for {num_envs} episodes: give one, or one for each."
             )
-        self._rewards = [reward_of(one) for one in given]
+        self._rewards = [reward_of(one) for one in rewards]
         low, high = self.actions.bounds
         self.single_action_space = spaces.Box(low, high, dtype=np.float64)
         self.action_space = batch_space(self.single_action_space, num_envs)
